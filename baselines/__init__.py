@@ -1,0 +1,1 @@
+"""Reference diagnosers: trivial ones, the filters of the literature, learned ones. One file each, discovered."""

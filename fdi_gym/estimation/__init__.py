@@ -1,0 +1,1 @@
+"""Atoms that several filters share: updates, two-stage algebra, tests on innovations, decision logic."""

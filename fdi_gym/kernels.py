@@ -1,0 +1,334 @@
+"""Compiled generic kernels: what every plant shares, written once for any plant's equations.
+
+A plant file writes its equations as plain functions and marks them with `kernel`. The parameter names say which
+role a function has, and the role fixes its compiled signature:
+
+    dynamics(t, x, u, theta, d, p, dx)   xdot, or for a discrete plant (`substeps=0`) the next state
+    output(t, x, u, theta, d, p, y)      noise-free sensor values; u is the command held up to t
+    control(t, y, r, q, c, u)            the command u from the measurement y; updates the controller state c
+    known(t, r, c, out)                  what else the flight computer knows at t, before it computes the command
+    project(x, theta)                    puts the state back on its manifold after a step (unit quaternion, jammed fin)
+    outside(t, x, r)                     True where the flight ends: validity of the model or loss of control
+
+with t the time [s], x the state, theta the fault parameter, d the disturbance, p the physical parameters, r the row
+of exogenous references, q the controller's parameters. A function with any other parameters is a helper that the
+file's kernels may call. A kernel must not call a kernel of another file, which is what keeps numba's disk cache valid:
+the generic kernels below get the addresses of the plant's compiled functions (`address`) and call through them. So
+they are compiled once for all plants, nothing is compiled to bring the two together, and a call costs a microsecond.
+
+The cache lies in the user's cache folder (or `FDI_GYM_CACHE_DIR`) under a hash of the package's sources and of the
+file that defines the kernel, so that no edit is ever answered by old code.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import inspect
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+import numpy as np
+import platformdirs
+from numba import boolean, float64, int64, types, void
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+F = TypeVar("F", bound=Callable[..., Any])
+V, M = float64[::1], float64[:, ::1]
+
+_MAP = void(float64, V, V, V, V, V, V)
+_CONTROL = void(float64, V, V, V, V, V)
+_KNOWN = void(float64, V, V, V)
+_PROJECT = void(V, V)
+_OUTSIDE = boolean(float64, V, V)
+_ROLES = {
+    ("t", "x", "u", "theta", "d", "p", "dx"): _MAP,
+    ("t", "x", "u", "theta", "d", "p", "y"): _MAP,
+    ("t", "y", "r", "q", "c", "u"): _CONTROL,
+    ("t", "r", "c", "out"): _KNOWN,
+    ("x", "theta"): _PROJECT,
+    ("t", "x", "r"): _OUTSIDE,
+}
+
+
+@functools.cache
+def _package_hash() -> str:
+    """Hash of every source file of the package: a changed helper anywhere means a new cache folder."""
+    digest = hashlib.sha256()
+    root = Path(__file__).parent
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@contextlib.contextmanager
+def _cache_folder(source: str) -> Iterator[bool]:
+    """Point numba at the cache folder that belongs to these sources; yields False where it cannot be written."""
+    own = hashlib.sha256(Path(source).read_bytes()).hexdigest()[:16] if Path(source).is_file() else "interactive"
+    base = Path(os.environ.get("FDI_GYM_CACHE_DIR") or platformdirs.user_cache_path("fdi_gym"))
+    folder = base / f"{_package_hash()}-{own}"
+    try:
+        cold = not folder.exists()
+        folder.mkdir(parents=True, exist_ok=True)
+        writable = own != "interactive" and os.access(folder, os.W_OK)
+    except OSError:
+        cold, writable = True, False
+    if cold and own != "interactive":
+        print(f"fdi_gym: compiling {Path(source).stem} (once; kept in {base})", file=sys.stderr, flush=True)
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(folder) if writable else before
+    try:
+        yield writable
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+def kernel(function: F) -> F:
+    """Compile a plant's function for the role that its parameter names declare (see the module's docstring)."""
+    role = _ROLES.get(tuple(inspect.signature(function).parameters))
+    if role is None:
+        return numba.njit(error_model="numpy")(function)
+    with _cache_folder(function.__code__.co_filename) as writable:
+        return numba.njit(role, cache=writable, error_model="numpy")(function)
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Plant functions as numbers
+
+
+def address(compiled: Any) -> int:
+    """The address of a compiled kernel, by which the generic kernels call it. Valid as long as `compiled` lives."""
+    (result,) = compiled.overloads.values()
+    return result.library.get_pointer_to_function(result.fndesc.llvm_func_name)
+
+
+def _function_at(signature):
+    """An intrinsic that makes numba's first-class function of this signature from an address."""
+    function_type = types.FunctionType(signature)
+
+    @intrinsic
+    def function_at(typing_context, where):
+        def codegen(context, builder, _, arguments):
+            function = cgutils.create_struct_proxy(function_type)(context, builder)
+            function.jit_addr = builder.inttoptr(arguments[0], cgutils.voidptr_t)
+            function.c_addr = function.py_addr = cgutils.get_null_value(cgutils.voidptr_t)
+            return function._getvalue()
+
+        return function_type(int64), codegen
+
+    return function_at
+
+
+_map_at, _control_at, _known_at = _function_at(_MAP), _function_at(_CONTROL), _function_at(_KNOWN)
+_project_at, _outside_at = _function_at(_PROJECT), _function_at(_OUTSIDE)
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# What a plant need not write
+
+
+@kernel
+def known(t, r, c, out):
+    """Nothing else is known: the default of a plant without known signals."""
+
+
+@kernel
+def project(x, theta):
+    """The state space is flat: the default of a plant without a manifold."""
+
+
+@kernel
+def outside(t, x, r):
+    """The model holds everywhere: the default of a plant without a termination rule."""
+    return False
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Generic kernels
+
+
+def _generic(signature):
+    """Compile a generic kernel of this file with its explicit signature, cached."""
+
+    def decorate(function):
+        with _cache_folder(__file__) as writable:
+            return numba.njit(signature, cache=writable, error_model="numpy")(function)
+
+    return decorate
+
+
+@numba.njit
+def _theta_at(tau, a, b, g, theta):
+    for j in range(theta.size):
+        theta[j] = a[j] if b[j] == 0.0 else a[j] + b[j] * np.exp(-g[j] * tau)
+
+
+@numba.njit
+def _advance(dynamics, project, t, dt, substeps, x, u, a, b, g, d, p, theta, k1, k2, k3, k4, z):
+    """One sample interval: x(t) -> x(t + dt) in place, theta(t + tau) = a + b exp(-g tau), u and d held.
+
+    Classical Runge-Kutta with `substeps` steps; for `substeps` = 0 the plant is discrete and maps x itself.
+    """
+    n = x.size
+    if substeps == 0:
+        _theta_at(0.0, a, b, g, theta)
+        dynamics(t, x, u, theta, d, p, k1)
+        for i in range(n):
+            x[i] = k1[i]
+    else:
+        h = dt / substeps
+        for s in range(substeps):
+            tau = s * h
+            _theta_at(tau, a, b, g, theta)
+            dynamics(t + tau, x, u, theta, d, p, k1)
+            for i in range(n):
+                z[i] = x[i] + 0.5 * h * k1[i]
+            _theta_at(tau + 0.5 * h, a, b, g, theta)
+            dynamics(t + tau + 0.5 * h, z, u, theta, d, p, k2)
+            for i in range(n):
+                z[i] = x[i] + 0.5 * h * k2[i]
+            dynamics(t + tau + 0.5 * h, z, u, theta, d, p, k3)
+            for i in range(n):
+                z[i] = x[i] + h * k3[i]
+            _theta_at(tau + h, a, b, g, theta)
+            dynamics(t + tau + h, z, u, theta, d, p, k4)
+            for i in range(n):
+                x[i] += h / 6.0 * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i])
+    _theta_at(dt, a, b, g, theta)
+    project(x, theta)
+
+
+@_generic(void(int64, int64, float64, int64, V, M, M, M, M, M, M))
+def propagate(dynamics_at, project_at, dt, substeps, t, x, u, theta, d, p, out):
+    """out[i] = the state one sample after x[i]; t, u, theta, d, p have m rows that serve M/m consecutive points each."""
+    dynamics, project = _map_at(dynamics_at), _project_at(project_at)
+    points, n = x.shape
+    xi, ui, ti, di, pi = np.empty(n), np.empty(u.shape[1]), np.empty(theta.shape[1]), np.empty(d.shape[1]), np.empty(p.shape[1])
+    b, g, work = np.zeros(ti.size), np.zeros(ti.size), np.empty(ti.size)
+    k1, k2, k3, k4, z = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    every_t, every_u, every_theta = points // t.size, points // u.shape[0], points // theta.shape[0]
+    every_d, every_p = points // d.shape[0], points // p.shape[0]
+    for i in range(points):
+        for j in range(n):
+            xi[j] = x[i, j]
+        for j in range(ui.size):
+            ui[j] = u[i // every_u, j]
+        for j in range(ti.size):
+            ti[j] = theta[i // every_theta, j]
+        for j in range(di.size):
+            di[j] = d[i // every_d, j]
+        for j in range(pi.size):
+            pi[j] = p[i // every_p, j]
+        _advance(dynamics, project, t[i // every_t], dt, substeps, xi, ui, ti, b, g, di, pi, work, k1, k2, k3, k4, z)
+        for j in range(n):
+            out[i, j] = xi[j]
+
+
+@_generic(void(int64, V, M, M, M, M, M, M))
+def evaluate(function_at, t, x, u, theta, d, p, out):
+    """out[i] = function(t, x[i], ...): the sensors' values or the state's rate of change, rows served as in `propagate`."""
+    function = _map_at(function_at)
+    points = x.shape[0]
+    xi, ui, ti = np.empty(x.shape[1]), np.empty(u.shape[1]), np.empty(theta.shape[1])
+    di, pi, oi = np.empty(d.shape[1]), np.empty(p.shape[1]), np.empty(out.shape[1])
+    every_t, every_u, every_theta = points // t.size, points // u.shape[0], points // theta.shape[0]
+    every_d, every_p = points // d.shape[0], points // p.shape[0]
+    for i in range(points):
+        for j in range(xi.size):
+            xi[j] = x[i, j]
+        for j in range(ui.size):
+            ui[j] = u[i // every_u, j]
+        for j in range(ti.size):
+            ti[j] = theta[i // every_theta, j]
+        for j in range(di.size):
+            di[j] = d[i // every_d, j]
+        for j in range(pi.size):
+            pi[j] = p[i // every_p, j]
+        function(t[i // every_t], xi, ui, ti, di, pi, oi)
+        for j in range(oi.size):
+            out[i, j] = oi[j]
+
+
+@_generic(int64(int64, int64, int64, int64, int64, int64, float64, int64,
+                V, V, V, V, M, M, M, M, M, int64[:, ::1], M, M, M, V, V, M, M, M))
+def simulate(dynamics_at, output_at, control_at, known_at, project_at, outside_at, dt, substeps,
+             x0, u0, c0, q, r, d, a, b, g, holds, w, v, sensor_range, p, nominal, X, O, TH):
+    """One closed-loop flight of K = len(w) samples. THE order of operations in a step is written here and nowhere else.
+
+    At sample k: the sensors give y_k; what else is known gives n_k; the controller computes u_k, held until k + 1;
+    entries of theta that a hold fault owns take their value; the plant advances to X[k+1] under TH[k+1], the fault
+    parameter that acts over [k, k+1) (its value at the interval's end); process noise is added.
+    The observation is O[k] = [y_k, u_{k-1}, n_k]. u_{-1} is the trim command and TH[0] the nominal parameter: no
+    interval has ended before sample 0.
+
+    `holds` has the rows (theta entry, first step, end step, command index, lag): from the first step on the entry holds
+    the command of `lag` steps before. Returns the number of steps flown, negative where the flight ended early.
+    """
+    dynamics, output, control = _map_at(dynamics_at), _map_at(output_at), _control_at(control_at)
+    known, project, outside = _known_at(known_at), _project_at(project_at), _outside_at(outside_at)
+    steps, n = w.shape
+    p_theta, n_y, n_u = TH.shape[1], v.shape[1], u0.size
+    n_n = O.shape[1] - n_y - n_u
+    x, u, c, y, out = x0.copy(), u0.copy(), c0.copy(), np.empty(n_y), np.empty(n_n)
+    ak, bk, gk, theta = np.empty(p_theta), np.empty(p_theta), np.empty(p_theta), np.empty(p_theta)
+    rk, dk, held = np.empty(r.shape[1]), np.empty(d.shape[1]), np.zeros(holds.shape[0])
+    k1, k2, k3, k4, z, last = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    for j in range(p_theta):
+        TH[0, j] = nominal[j]
+    for i in range(n_u):
+        O[0, n_y + i] = u[i]
+    for i in range(n):
+        X[0, i] = x[i]
+    ended = False
+    for k in range(steps + 1):
+        t = k * dt
+        for j in range(rk.size):
+            rk[j] = r[k, j]
+        for j in range(dk.size):
+            dk[j] = d[min(k, steps - 1), j]
+        for j in range(p_theta):
+            ak[j], bk[j], gk[j] = a[k, j], b[k, j], g[k, j]
+        for h in range(holds.shape[0]):
+            if holds[h, 1] < k < holds[h, 2]:
+                ak[holds[h, 0]] = held[h]
+        for j in range(p_theta):
+            theta[j] = ak[j] + bk[j]
+        output(t, x, u, theta, dk, p, y)
+        for i in range(n_y):
+            y[i] = min(max(y[i] + v[k, i], sensor_range[0, i]), sensor_range[1, i])
+            O[k, i] = y[i]
+        known(t, rk, c, out)
+        for i in range(n_n):
+            O[k, n_y + n_u + i] = out[i]
+        if k == steps or ended:
+            return -k if ended else k
+        control(t, y, rk, q, c, u)
+        for i in range(n_u):
+            O[k + 1, n_y + i] = u[i]
+        for h in range(holds.shape[0]):
+            if holds[h, 1] == k:
+                held[h] = O[max(k + 1 - holds[h, 4], 0), n_y + holds[h, 3]]
+                ak[holds[h, 0]] = held[h]
+        for i in range(n):
+            last[i] = x[i]
+        _advance(dynamics, project, t, dt, substeps, x, u, ak, bk, gk, dk, p, theta, k1, k2, k3, k4, z)
+        for j in range(p_theta):
+            TH[k + 1, j] = theta[j]
+        for i in range(n):
+            x[i] += w[k, i]
+            ended = ended or not np.isfinite(x[i])
+        if ended:  # the state has left the numbers: the last finite one is what is shown
+            for i in range(n):
+                x[i] = last[i]
+        for i in range(n):
+            X[k + 1, i] = x[i]
+        for j in range(rk.size):
+            rk[j] = r[k + 1, j]
+        ended = ended or outside(t + dt, x, rk)
+    return steps
