@@ -209,7 +209,13 @@ def propagate(dynamics_at, project_at, dt, substeps, t, x, u, theta, d, p, out):
     """out[i] = the state one sample after x[i]; t, u, theta, d, p have m rows that serve M/m consecutive points each."""
     dynamics, project = _map_at(dynamics_at), _project_at(project_at)
     points, n = x.shape
-    xi, ui, ti, di, pi = np.empty(n), np.empty(u.shape[1]), np.empty(theta.shape[1]), np.empty(d.shape[1]), np.empty(p.shape[1])
+    xi, ui, ti, di, pi = (
+        np.empty(n),
+        np.empty(u.shape[1]),
+        np.empty(theta.shape[1]),
+        np.empty(d.shape[1]),
+        np.empty(p.shape[1]),
+    )
     b, g, work = np.zeros(ti.size), np.zeros(ti.size), np.empty(ti.size)
     k1, k2, k3, k4, z = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     every_t, every_u, every_theta = points // t.size, points // u.shape[0], points // theta.shape[0]
@@ -255,10 +261,64 @@ def evaluate(function_at, t, x, u, theta, d, p, out):
             out[i, j] = oi[j]
 
 
-@_generic(int64(int64, int64, int64, int64, int64, int64, float64, int64,
-                V, V, V, V, M, M, M, M, M, int64[:, ::1], M, M, M, V, V, M, M, M))
-def simulate(dynamics_at, output_at, control_at, known_at, project_at, outside_at, dt, substeps,
-             x0, u0, c0, q, r, d, a, b, g, holds, w, v, sensor_range, p, nominal, X, O, TH):
+@_generic(
+    int64(
+        int64,
+        int64,
+        int64,
+        int64,
+        int64,
+        int64,
+        float64,
+        int64,
+        V,
+        V,
+        V,
+        V,
+        M,
+        M,
+        M,
+        M,
+        M,
+        int64[:, ::1],
+        M,
+        M,
+        M,
+        V,
+        V,
+        M,
+        M,
+        M,
+    )
+)
+def simulate(
+    dynamics_at,
+    output_at,
+    control_at,
+    known_at,
+    project_at,
+    outside_at,
+    dt,
+    substeps,
+    x0,
+    u0,
+    c0,
+    q,
+    r,
+    d,
+    a,
+    b,
+    g,
+    holds,
+    w,
+    v,
+    sensor_range,
+    p,
+    nominal,
+    X,
+    O,
+    TH,
+):
     """One closed-loop flight of K = len(w) samples. THE order of operations in a step is written here and nowhere else.
 
     At sample k: the sensors give y_k; what else is known gives n_k; the controller computes u_k, held until k + 1;

@@ -53,12 +53,18 @@ class FaultMode(NamedTuple):
         description: What it does to theta.
         size: Maps theta (..., n_theta) to the fault's size (...), for accuracy by severity.
         bands: Sizes below the first are "small", below the second "medium", else "large".
+        offset, direction, reach: The line that the fault spans in the estimated space, as a deviation from healthy:
+            offset + m direction with m in reach. A stuck surface has offset -1 in its effectiveness, direction its
+            position. Two faults add their deviations.
     """
 
     name: str
     description: str
     size: Callable[[Array], Array]
     bands: tuple[float, float]
+    offset: tuple[float, ...]
+    direction: tuple[float, ...]
+    reach: tuple[float, float]
 
 
 class Label(NamedTuple):
@@ -95,7 +101,9 @@ def _no_rows(scenario: FaultScenario) -> Array:
 
 def _no_change(physical: Mapping[str, Any]) -> Array:
     if physical:
-        raise ValueError(f"this plant has no physical parameters to change, but the scenario sets {', '.join(physical)}")
+        raise ValueError(
+            f"this plant has no physical parameters to change, but the scenario sets {', '.join(physical)}"
+        )
     return np.zeros(0)
 
 
@@ -164,7 +172,9 @@ class Plant:
         names = {mode.name for mode in self.modes}
         unknown = {name for label in self.labels for name in label.modes} - names
         if unknown or not self.labels or self.labels[0].modes:
-            raise ValueError(f"labels start with the empty set and use declared modes {sorted(names)}, not {sorted(unknown)}")
+            raise ValueError(
+                f"labels start with the empty set and use declared modes {sorted(names)}, not {sorted(unknown)}"
+            )
         if "standard" not in self.processes:
             raise ValueError(f"a plant needs a 'standard' fault process; {self.id} has {', '.join(self.processes)}")
         if not self.estimated:
@@ -234,9 +244,7 @@ class Plant:
         ends = [scenario.steps if f.end is None else min(f.end, scenario.steps) for f in scenario.faults]
         edges = sorted({0, scenario.steps, *(min(f.onset, scenario.steps) for f in scenario.faults), *ends})
         for start, stop in zip(edges[:-1], edges[1:], strict=True):
-            active = frozenset(
-                f.mode for f, end in zip(scenario.faults, ends, strict=True) if f.onset <= start < end
-            )
+            active = frozenset(f.mode for f, end in zip(scenario.faults, ends, strict=True) if f.onset <= start < end)
             rows[start + 1 : stop + 1] = self.label_of(active)
         return rows
 

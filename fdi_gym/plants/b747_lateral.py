@@ -200,7 +200,9 @@ def loss(surface: str, gamma: float, onset: int, end: int | None = None) -> Faul
 def stuck(surface: str, b: float | None, onset: int, end: int | None = None, kind: str = "position") -> Fault:
     """A stuck surface: u_eff = b [deg]; b = None freezes it where it is commanded at the onset (jam)."""
     place = Hold(f"b_{surface}", surface) if b is None else Abrupt(f"b_{surface}", b)
-    return Fault(f"{surface} stuck", "jam" if b is None else kind, onset, [Abrupt(f"gamma_{surface}", -1.0), place], end)
+    return Fault(
+        f"{surface} stuck", "jam" if b is None else kind, onset, [Abrupt(f"gamma_{surface}", -1.0), place], end
+    )
 
 
 def paper(command: str = "multisine", signs_seed: int = 0) -> FaultScenario:
@@ -289,13 +291,15 @@ def processes(airframe: str, closed: bool, dual: bool) -> dict[str, FaultProcess
 
 
 def _modes(airframe: str) -> tuple[FaultMode, ...]:
-    modes = []
+    modes, unit = [], np.eye(4)
     for i, surface in enumerate(SURFACES):
         b = B_STUCK_MAX[airframe][i]
         modes += [
-            FaultMode(f"{surface} LOE", f"gamma_{surface} in (-1, 0)", lambda th, i=i: np.abs(th[..., i]), (0.5, 0.7)),
+            FaultMode(f"{surface} LOE", f"gamma_{surface} in (-1, 0)", lambda th, i=i: np.abs(th[..., i]), (0.5, 0.7),
+                      offset=(0.0,) * 4, direction=tuple(unit[i]), reach=(-0.95, -0.10)),
             FaultMode(f"{surface} stuck", f"gamma_{surface} = -1, b_{surface} [deg] is where",
-                      lambda th, i=i: np.abs(th[..., 2 + i]), (b / 3, 2 * b / 3)),
+                      lambda th, i=i: np.abs(th[..., 2 + i]), (b / 3, 2 * b / 3),
+                      offset=tuple(-unit[i]), direction=tuple(unit[2 + i]), reach=(-U_MAX[i], U_MAX[i])),
         ]  # fmt: skip
     return tuple(modes)
 

@@ -1,0 +1,1 @@
+"""The filters of the literature, one file per published method."""
