@@ -236,9 +236,7 @@ def known_onset_oracle(
             log_w = ratio + LOG_WEIGHT
             w = np.exp(log_w - logsumexp(log_w, axis=1, keepdims=True))
             probs = np.column_stack([w[:, label == LABEL].sum(axis=1) for label in range(1, 5)])
-            log_probs = np.where(
-                on[:, None], np.log(np.maximum(np.column_stack([np.zeros(n), probs]), 1e-300)), log_probs
-            )
+            log_probs = np.where(on[:, None], np.log(np.maximum(np.column_stack([np.zeros(n), probs]), 1e-300)), log_probs)
             theta = (w[..., None] * sizes).sum(axis=1) * on[:, None]
         return (k + 1, active, begins, x, M, G, g, u_onset), answer(log_probs, theta)
 

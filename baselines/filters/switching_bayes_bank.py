@@ -98,15 +98,11 @@ def switching_bayes_bank(plant: Plant, *, gamma: tuple[float, float] = (-0.7, -0
             p = np.exp(each - top[:, None, None])
             healthy = np.exp(w_healthy - top) + p[:, gone].sum(axis=(1, 2))
             active = p[:, ~gone]
-            probs = np.column_stack(
-                [healthy, *(active[:, :, label == LABEL].sum(axis=(1, 2)) for label in range(1, 5))]
-            )
+            probs = np.column_stack([healthy, *(active[:, :, label == LABEL].sum(axis=(1, 2)) for label in range(1, 5))])
             total = probs.sum(axis=1, keepdims=True)
             probs = probs / total
             mode = np.argmax(probs, axis=1)
-            last = Diagnosis(
-                mode > 0, mode, (active[..., None] * theta[:, ~gone]).sum(axis=(1, 2)) / total, None, probs
-            )
+            last = Diagnosis(mode > 0, mode, (active[..., None] * theta[:, ~gone]).sum(axis=(1, 2)) / total, None, probs)
         return (k + 1, x, w_healthy, [M, G, g, u_onset, w], tau, off, last), last
 
     return Diagnoser(init, update)

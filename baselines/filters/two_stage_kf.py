@@ -29,7 +29,6 @@ from fdi_gym.estimation.kalman import T, right_divide, symmetric, times
 from fdi_gym.estimation.linear import LinearModel, linear_model
 from fdi_gym.plant import Array, Plant
 
-
 FORGETTING = ("none", "directional", "exponential")
 
 

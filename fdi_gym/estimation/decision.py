@@ -191,16 +191,12 @@ def penalty_logic(plant: Plant, *, penalty: float = 8.0, change_after: int = 10,
         best = np.append(0, fits.labels)[np.argmin(cost, axis=1)]
         count = np.where(best == label, 0, np.where(best == candidate, count + 1, 1))
         label = np.where(count == change_after, best, label)
-        return (label, best, np.where(count == change_after, 0, count)), Decision(
-            label > 0, label, _structured(fits, label)
-        )
+        return (label, best, np.where(count == change_after, 0, count)), Decision(label > 0, label, _structured(fits, label))
 
     return Logic(start, step)
 
 
-def persistence_logic(
-    plant: Plant, candidate: Callable[[Array], Array], *, after: int = 20, warmup: int = 150
-) -> Logic:
+def persistence_logic(plant: Plant, candidate: Callable[[Array], Array], *, after: int = 20, warmup: int = 150) -> Logic:
     """The label becomes the candidate at the `after`-th consecutive sample on which that is the same.
 
     Args:
