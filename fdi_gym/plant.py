@@ -91,7 +91,7 @@ def squared_error(scale: Sequence[float]) -> Callable[[Array], Array]:
     weight = 1.0 / np.asarray(scale, float) ** 2
 
     def reward(error: Array) -> Array:
-        return -(error**2 @ weight)
+        return -(error**2 * weight).sum(axis=-1)  # not a matrix product: the same bits for one as for many
 
     return reward
 
