@@ -254,7 +254,7 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
             after = _choose(seen & ~lost, after, inner)
             if lost.any():
                 after = _choose(lost, raw.init(n), after)
-            kept = Diagnosis(*(a if b is not None and a is not None else b for a, b in zip(last, answer, strict=True)))
+            kept: Any = Diagnosis._make(b if a is None or b is None else a for a, b in zip(last, answer, strict=True))
             answer = _choose(seen & ~lost, answer, kept)
             theta = None if answer.theta is None else np.where(lost[:, None], np.nan, answer.theta)
             answer = answer._replace(alarm=answer.alarm & ~lost, mode=np.where(lost, -1, answer.mode), theta=theta)

@@ -70,8 +70,8 @@ def test_oracle_is_above_the_filter_and_null_below(rows):
 
 def test_a_killed_run_resumes_to_the_same_bytes(suite, tmp_path, monkeypatch):
     frozen = load_suite(suite)
-    monkeypatch.setattr(evaluation, "BLOCK", 4)
-    whole, _ = evaluate(frozen, NAMES, work=tmp_path / "a", jobs=1, progress=False)
+    small = {"jobs": 1, "progress": False, "block": 4}
+    whole, _ = evaluate(frozen, NAMES, work=tmp_path / "a", **small)
     calls = []
     real = evaluation.diagnose
 
@@ -83,18 +83,17 @@ def test_a_killed_run_resumes_to_the_same_bytes(suite, tmp_path, monkeypatch):
 
     monkeypatch.setattr(evaluation, "diagnose", killed)
     with pytest.raises(KeyboardInterrupt):
-        evaluate(frozen, NAMES, work=tmp_path / "b", jobs=1, progress=False)
+        evaluate(frozen, NAMES, work=tmp_path / "b", **small)
     calls.clear()
     calls.extend([1] * 10)
-    resumed, _ = evaluate(frozen, NAMES, work=tmp_path / "b", jobs=1, progress=False)
+    resumed, _ = evaluate(frozen, NAMES, work=tmp_path / "b", **small)
     assert len(calls) - 10 == 3 * len(NAMES) - 4  # what had been finished was not run again
     assert msgspec.json.encode(resumed) == msgspec.json.encode(whole)
     assert not list(tmp_path.rglob("*.part"))
 
 
-def test_rows_do_not_depend_on_the_blocks(suite, rows, tmp_path, monkeypatch):
-    monkeypatch.setattr(evaluation, "BLOCK", 5)
-    made, _ = evaluate(load_suite(suite), NAMES, work=tmp_path, jobs=2, progress=False)
+def test_rows_do_not_depend_on_the_blocks(suite, rows, tmp_path):
+    made, _ = evaluate(load_suite(suite), NAMES, work=tmp_path, jobs=2, progress=False, block=5)
     for name, row in made.items():
         before = leaderboard.read_row(leaderboard.row_path(rows, "small", name))
         assert row.metrics["per_sample"]["confusion"] == before.metrics["per_sample"]["confusion"]
