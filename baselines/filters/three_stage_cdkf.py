@@ -31,7 +31,9 @@ def initial_covariance(plant: Plant, std: Sequence[float]) -> Array:
         NotApplicableError: Not one standard deviation per state of this plant.
     """
     if len(std) != len(plant.states):
-        raise NotApplicableError(f"x0_std needs one entry per state of {plant.id} ({len(plant.states)}), not {len(std)}")
+        raise NotApplicableError(
+            f"x0_std needs one entry per state of {plant.id} ({len(plant.states)}), not {len(std)}"
+        )
     return np.diag(np.square(std))
 
 

@@ -125,7 +125,9 @@ def existence(plant: Plant, inputs: FaultInputs, H: Array, *, smallest: float = 
     needed = F.shape[1]
     length = np.linalg.norm(F, axis=0)
     if not (length > 0).all():
-        missing = [n for n, v in zip((*inputs.names, *(s.name for s in plant.disturbances)), length, strict=True) if not v]
+        missing = [
+            n for n, v in zip((*inputs.names, *(s.name for s in plant.disturbances)), length, strict=True) if not v
+        ]
         nothing = np.full(needed, np.nan)
         p = len(inputs.names)
         rank = int(np.linalg.matrix_rank(F)) if F.size and len(missing) < needed else 0
