@@ -1,7 +1,7 @@
 """Augmented-state central-difference Kalman filter (ASCDKF): state, fault and disturbance in one vector.
 
-The reference that the three-stage filters decouple. Fault and disturbance are random walks; sigma points are spread over
-the whole augmented vector. M. Norgaard, N. K. Poulsen, O. Ravn, Automatica 36(11), 2000.
+The reference that the three-stage filters decouple. Fault and disturbance are random walks; sigma points are spread
+over the whole augmented vector. M. Norgaard, N. K. Poulsen, O. Ravn, Automatica 36(11), 2000.
 """
 
 from __future__ import annotations

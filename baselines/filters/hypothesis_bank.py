@@ -78,7 +78,7 @@ def hypothesis_bank(
     Raises:
         NotApplicableError: The plant is not of that kind, or the settings have not one entry per fault.
     """
-    inputs, H0 = fault_inputs(plant, channels), linear_output(plant)
+    inputs, H = fault_inputs(plant, channels), linear_output(plant)
     for name, value in (("b_onset", b_onset), ("b_step", b_step)):
         if len(value) != len(plant.estimated):
             raise NotApplicableError(f"{name} needs one entry per fault of {plant.id}: {len(plant.estimated)}")
@@ -90,10 +90,12 @@ def hypothesis_bank(
     Pi = transitions(sets, one_more, one_less)
     keep = np.ones((L, N))
     keep[:, b_part] = sets
-    H = np.hstack([H0, np.zeros((len(H0), p + q))])
-    diag = lambda x, b, d: scipy.linalg.block_diag(x, np.diag(b), np.diag(d))  # noqa: E731
-    P0 = np.stack([diag(initial_covariance(plant, x0_std), s0**2 * m, np.full(q, d0_std**2)) for m in sets])
-    Qa = np.stack([diag(plant.Q, walk**2 * m, np.full(q, d_step**2)) for m in sets])
+
+    def blocks(x: Array, b: Array, d_std: float) -> Array:
+        return np.stack([scipy.linalg.block_diag(x, np.diag(b**2 * m), d_std**2 * np.eye(q)) for m in sets])
+
+    P0 = blocks(initial_covariance(plant, x0_std), s0, d0_std)
+    Qa = blocks(plant.Q, walk, d_step)
     X0 = np.tile(np.concatenate([plant.trim_state, np.zeros(p + q)]), (L, 1))
     mu0 = np.full(L, (1 - healthy) / (L - 1))
     mu0[0] = healthy
@@ -131,10 +133,10 @@ def hypothesis_bank(
         x = Xm.copy()
         x[..., :n_x] = F[:, :L]
         P = Phi @ Pm @ T(Phi) + Qa
-        PHt = P[..., :n_x] @ H0.T
-        C = H0 @ PHt[:, :, :n_x] + plant.R
+        PHt = P[..., :n_x] @ H.T
+        C = H @ PHt[:, :, :n_x] + plant.R
         K = right_divide(PHt, C)
-        nu = y[:, None] - x[..., :n_x] @ H0.T
+        nu = y[:, None] - x[..., :n_x] @ H.T
         x = x + (K @ nu[..., None])[..., 0]
         P = symmetric(P - K @ T(PHt))
         # (5) probabilities

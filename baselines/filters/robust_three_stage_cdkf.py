@@ -22,6 +22,7 @@ from fdi_gym.plant import Array, Plant
 
 
 @diagnoser("robust_three_stage_cdkf", "Robust three-stage central-difference Kalman filter (RThSCDKF)")
+@diagnoser("robust_three_stage_ekf", "Robust three-stage extended Kalman filter (RThSEKF)", rule="extended")
 def robust_three_stage_cdkf(
     plant: Plant,
     *,

@@ -1,4 +1,4 @@
-"""Three-stage central-difference Kalman filter, and its EKF counterpart: state, actuator faults and gust in three stages.
+"""Three-stage central-difference Kalman filter, and its EKF counterpart: state, fault and gust in three stages.
 
 Fault and gust are random walks; the propagation is at the full estimates with the spread of the decoupled state. The
 algebra is in `fdi_gym.estimation.three_stage`, the propagation rules in `fdi_gym.estimation.propagation`.
@@ -31,13 +31,12 @@ def initial_covariance(plant: Plant, std: Sequence[float]) -> Array:
         NotApplicableError: Not one standard deviation per state of this plant.
     """
     if len(std) != len(plant.states):
-        raise NotApplicableError(
-            f"x0_std needs one entry per state of {plant.id} ({len(plant.states)}), not {len(std)}"
-        )
+        raise NotApplicableError(f"x0_std needs one entry per state of {plant.id} ({len(plant.states)}), not {len(std)}")
     return np.diag(np.square(std))
 
 
 @diagnoser("three_stage_cdkf", "Three-stage central-difference Kalman filter (ThSCDKF)")
+@diagnoser("three_stage_ekf", "Three-stage extended Kalman filter (ThSEKF)", rule="extended")
 def three_stage_cdkf(
     plant: Plant,
     *,

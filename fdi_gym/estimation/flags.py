@@ -32,9 +32,7 @@ def start(n: int, p: int) -> Flags:
     return Flags(np.zeros((n, p)), np.zeros((n, p), np.int64), np.zeros((n, p), np.int64), np.zeros((n, p), bool))
 
 
-def step(
-    flags: Flags, b: Array, alpha: float, thresholds: Array, *, raise_after: int = 3, clear_after: int = 20
-) -> Flags:
+def step(flags: Flags, b: Array, alpha: float, thresholds: Array, *, raise_after: int = 3, clear_after: int = 20) -> Flags:
     """The logic after an estimate b (n, p)."""
     s = (1 - alpha) * flags.s + alpha * b
     size = np.abs(s)

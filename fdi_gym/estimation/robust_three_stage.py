@@ -82,7 +82,7 @@ def step(f: Propagated, y: Array, H: Array, Q: Array, R: Array) -> RobustThreeSt
 
 
 def input_gain(f: Propagated, H: Array, Q: Array, R: Array) -> tuple[Array, Array]:
-    """L (n, n_x, n_y) and P (n, n_x, n_x) of the joint unbiased minimum-variance filter with G = [B E]: the same filter.
+    """Gain L (n, n_x, n_y) and covariance P of the joint unbiased minimum-variance filter with G = [B E]: the same filter.
 
     L = Kx + (G - Kx F) M, M = (F' C1^-1 F)^-1 F' C1^-1, F = H G; P = (I - L H) P- (I - L H)' + L R L'.
     """
@@ -125,9 +125,7 @@ def existence(plant: Plant, inputs: FaultInputs, H: Array, *, smallest: float = 
     needed = F.shape[1]
     length = np.linalg.norm(F, axis=0)
     if not (length > 0).all():
-        missing = [
-            n for n, v in zip((*inputs.names, *(s.name for s in plant.disturbances)), length, strict=True) if not v
-        ]
+        missing = [n for n, v in zip((*inputs.names, *(s.name for s in plant.disturbances)), length, strict=True) if not v]
         nothing = np.full(needed, np.nan)
         p = len(inputs.names)
         rank = int(np.linalg.matrix_rank(F)) if F.size and len(missing) < needed else 0
@@ -149,7 +147,7 @@ def existence(plant: Plant, inputs: FaultInputs, H: Array, *, smallest: float = 
         L = input_gain(f, H, plant.Q, plant.R)[0][0]
         found = step(f, zero[None], H, plant.Q, plant.R)
         P = found.P[0]
-        if not np.isfinite(P).all() or np.abs(P - before).max() <= 1e-13 * np.abs(P).max():
+        if not np.isfinite(P).all() or np.abs(P - before).max() <= 1e-11 * np.abs(P).max():
             break
     radius = float(np.abs(np.linalg.eigvals((np.eye(len(A)) - L @ H) @ A)).max()) if np.isfinite(L).all() else np.inf
     assert found is not None
