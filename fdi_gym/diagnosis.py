@@ -253,7 +253,7 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
             lost = lost | (failed & seen)
             after = _choose(seen & ~lost, after, inner)
             if lost.any():
-                after = _choose(lost, raw.init(n), after)
+                after = _choose(~lost, after, raw.init(n))  # shared counters are those of the episodes that go on
             kept = Diagnosis(*(a if b is not None and a is not None else b for a, b in zip(last, answer, strict=True)))
             answer = _choose(seen & ~lost, answer, kept)
             theta = None if answer.theta is None else np.where(lost[:, None], np.nan, answer.theta)
