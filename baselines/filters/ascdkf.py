@@ -77,7 +77,7 @@ def ascdkf(
         points = central_difference_points(s.x, np.linalg.cholesky(s.P), h)
         theta = np.tile(plant.nominal_theta, (*points.shape[:2], 1))
         theta[..., inputs.entries] += points[..., fault]
-        points[..., :n_x] = plant.propagate(t, points[..., :n_x], u, theta, points[..., dist])
+        points[..., :n_x] = plant.propagate(t, points[..., :n_x], u, theta, points[..., dist] if q else None)
         x, Pf, _ = central_difference_moments(points, h)
         P = Pf + Qa
         PHt = P[..., :n_x] @ H.T

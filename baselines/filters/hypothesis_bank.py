@@ -110,7 +110,7 @@ def hypothesis_bank(
         """F for all points X (n, m, N) in one call."""
         theta = np.tile(plant.nominal_theta, (*X.shape[:2], 1))
         theta[..., inputs.entries] += X[..., b_part]
-        return plant.propagate(t, np.ascontiguousarray(X[..., :n_x]), u, theta, np.ascontiguousarray(X[..., n_x + p :]))
+        return plant.propagate(t, X[..., :n_x], u, theta, X[..., n_x + p :] if q else None)
 
     def step(s: Bank, t: float, u: Array, y: Array) -> Bank:
         X, P, mu = s.X, s.P, s.mu

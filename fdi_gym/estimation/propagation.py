@@ -66,20 +66,30 @@ def linear_output(plant: Plant) -> Array:
     x = rng.standard_normal((8, n_x))
     u = plant.trim_command + rng.standard_normal((8, len(plant.commands)))
     theta = plant.nominal_theta + rng.standard_normal((8, len(plant.theta)))
-    d = rng.standard_normal((8, len(plant.disturbances)))
+    d = rng.standard_normal((8, len(plant.disturbances))) if plant.disturbances else None
     if not np.allclose(plant.measure(0.0, x, u, theta, d), x @ H.T, rtol=1e-9, atol=1e-9):
         raise NotApplicableError(f"needs sensors y = H x; those of {plant.id} are not")
     return H
 
 
 class Propagated(NamedTuple):
-    """What a rule gives."""
+    """What a rule gives. The Jacobian with respect to the state is A = D S^-1."""
 
     x: Array  # (n, n_x) mean after the sample
     P: Array  # (n, n_x, n_x) spread, process noise not included
-    A: Array  # (n, n_x, n_x) Jacobians with respect to the state,
-    B: Array  # (n, n_x, p) the fault vector
+    D: Array  # (n, n_x, n_x) how the spread's columns come out,
+    S: Array | None  # (n, n_x, n_x) and how they went in; None: the identity
+    B: Array  # (n, n_x, p) Jacobian with respect to the fault vector
     E: Array  # (n, n_x, q) and the disturbance
+
+    def carry(self, V: Array) -> Array:
+        """A V for V (n, n_x, m)."""
+        return self.D @ (V if self.S is None else np.linalg.solve(self.S, V))
+
+    @property
+    def A(self) -> Array:
+        """The Jacobian itself (n, n_x, n_x)."""
+        return self.D if self.S is None else self.carry(np.tile(np.eye(self.D.shape[-1]), (len(self.D), 1, 1)))
 
 
 Rule = Callable[..., Propagated]  # rule(t, x (n, n_x), P (n, n_x, n_x), u (n, n_u), b (n, p), d (n, q))
@@ -138,10 +148,9 @@ def central_difference_rule(
         points[:, :ahead] = central_difference_points(x, S, h)
         points[:, ahead:] = x[:, None]
         theta = inputs.theta(plant, b)[:, None] + step_theta
-        F = plant.propagate(t, points, u, theta, d[:, None] + step_dist)
+        F = plant.propagate(t, points, u, theta, d[:, None] + step_dist if q else None)
         mean, Pf, D1 = central_difference_moments(F[:, :ahead], h)
-        A = T(np.linalg.solve(T(S), T(D1)))
-        return Propagated(mean, Pf, A, *_differences(F, ahead, p, q, step_b, step_d))
+        return Propagated(mean, Pf, D1, S, *_differences(F, ahead, p, q, step_b, step_d))
 
     return rule
 
@@ -158,9 +167,9 @@ def extended_rule(
 
     def rule(t: Any, x: Array, P: Array, u: Array, b: Array, d: Array) -> Propagated:
         theta = inputs.theta(plant, b)[:, None] + step_theta
-        F = plant.propagate(t, x[:, None] + step_state, u, theta, d[:, None] + step_dist)
+        F = plant.propagate(t, x[:, None] + step_state, u, theta, d[:, None] + step_dist if q else None)
         A = T(F[:, 1 : n_x + 1] - F[:, n_x + 1 : ahead]) / (2 * step_x)
-        return Propagated(F[:, 0], symmetric(A @ P @ T(A)), A, *_differences(F, ahead, p, q, step_b, step_d))
+        return Propagated(F[:, 0], symmetric(A @ P @ T(A)), A, None, *_differences(F, ahead, p, q, step_b, step_d))
 
     return rule
 
@@ -172,4 +181,4 @@ def trim_model(plant: Plant, inputs: FaultInputs) -> Propagated:
         0.0, plant.trim_state[None], np.eye(n_x)[None], plant.trim_command[None], zero,
         np.zeros((1, len(plant.disturbances))),
     )  # fmt: skip
-    return Propagated(*(part[0] for part in found))
+    return Propagated(*(None if part is None else part[0] for part in found))

@@ -143,11 +143,12 @@ def existence(plant: Plant, inputs: FaultInputs, H: Array, *, smallest: float = 
     found = None
     for _ in range(samples):
         before = P
-        f = Propagated(np.zeros((1, len(A))), (A @ P @ A.T)[None], A[None], at.B[None], at.E[None])
+        f = Propagated(np.zeros((1, len(A))), (A @ P @ A.T)[None], A[None], None, at.B[None], at.E[None])
         L = input_gain(f, H, plant.Q, plant.R)[0][0]
         found = step(f, zero[None], H, plant.Q, plant.R)
         P = found.P[0]
-        if not np.isfinite(P).all() or np.abs(P - before).max() <= 1e-11 * np.abs(P).max():
+        size = np.abs(P).max()
+        if np.abs(P - before).max() <= 1e-11 * size or not size < 1e12:  # steady, or growing without bound
             break
     radius = float(np.abs(np.linalg.eigvals((np.eye(len(A)) - L @ H) @ A)).max()) if np.isfinite(L).all() else np.inf
     assert found is not None

@@ -94,8 +94,9 @@ def step(
     """
     x, b, d, Px, Pb, Pd, V12, V13, V23 = s
     # time update of the couplings
-    W12 = f.A @ V12 + f.B
-    W13 = f.A @ V13 + f.B @ V23 + f.E
+    AV = f.carry(np.concatenate([V12, V13], axis=2))
+    W12 = AV[..., : b.shape[1]] + f.B
+    W13 = AV[..., b.shape[1] :] + f.B @ V23 + f.E
     W23 = V23
     Pd_ = Pd + Qd
     W23Pd, W13Pd = W23 @ Pd, W13 @ Pd

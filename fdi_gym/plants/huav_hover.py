@@ -84,6 +84,7 @@ BLADES = 2
 K_BETA = 54.0  # N m/rad: hub spring
 S_X, S_Y = 0.1, 0.22  # m^2: drag areas of the fuselage
 TAU_F = 16 / (0.8 * OM_MR)  # s: stabiliser bar, Lock number 0.8
+PER_TAU_F = 1 / TAU_F
 K_F = 1.0  # stabiliser flapping to tip-path plane
 A_CYC = 4.2  # static swash plate to tip-path plane, K_B + K_H K_F
 OFFSET_PED = 0.206  # rad: blade angle at zero pedal, so that the trim pedal is about -0.01
@@ -127,7 +128,7 @@ def dynamics(t, x, u, theta, d, p, dx):
     a1f, b1f = x[9], x[10]
     col, lon = theta[0] * u[0] + theta[4], theta[1] * u[1] + theta[5]
     lat, ped = theta[2] * u[2] + theta[6], theta[3] * u[3] + theta[7]
-    m, jxx, jyy, jzz, k_b, k_h = p[0], p[1], p[2], p[3], p[4], p[5]
+    per_m, per_jxx, per_jyy, per_jzz, k_b, k_h = p[0], p[1], p[2], p[3], p[4], p[5]
 
     tm = thrust(CT_M, DT_M, col)
     qm = CQ_M * tm * np.sqrt(tm) + DQ_M
@@ -136,19 +137,19 @@ def dynamics(t, x, u, theta, d, p, dx):
     a1, b1 = k_b * lon + K_F * a1f, k_b * lat + K_F * b1f
     hub = tm * H_MR + K_BETA
     sin_phi, cos_phi, sin_pitch, cos_pitch = np.sin(phi), np.cos(phi), np.sin(pitch), np.cos(pitch)
-    turn = pitch_rate * sin_phi + yaw_rate * cos_phi
+    psi_rate = (pitch_rate * sin_phi + yaw_rate * cos_phi) / cos_pitch
 
-    dx[0] = -G * sin_pitch - tm / m * a1 + p[6] * d[0]
-    dx[1] = G * sin_phi * cos_pitch + (tm * b1 - tt) / m + p[7] * d[1]
-    dx[2] = G * cos_phi * cos_pitch - tm / m
-    dx[3] = (hub * b1 - H_TR * tt) / jxx + p[8] * d[1]
-    dx[4] = (hub * a1 - qt) / jyy
-    dx[5] = (D_TR * tt - qm) / jzz + p[9] * d[1]
-    dx[6] = roll_rate + sin_pitch / cos_pitch * turn
+    dx[0] = -G * sin_pitch - tm * a1 * per_m + p[6] * d[0]
+    dx[1] = G * sin_phi * cos_pitch + (tm * b1 - tt) * per_m + p[7] * d[1]
+    dx[2] = G * cos_phi * cos_pitch - tm * per_m
+    dx[3] = (hub * b1 - H_TR * tt) * per_jxx + p[8] * d[1]
+    dx[4] = (hub * a1 - qt) * per_jyy
+    dx[5] = (D_TR * tt - qm) * per_jzz + p[9] * d[1]
+    dx[6] = roll_rate + sin_pitch * psi_rate
     dx[7] = pitch_rate * cos_phi - yaw_rate * sin_phi
-    dx[8] = turn / cos_pitch
-    dx[9] = -pitch_rate - a1f / TAU_F + k_h / TAU_F * lon
-    dx[10] = -roll_rate - b1f / TAU_F + k_h / TAU_F * lat
+    dx[8] = psi_rate
+    dx[9] = -pitch_rate + (k_h * lon - a1f) * PER_TAU_F
+    dx[10] = -roll_rate + (k_h * lat - b1f) * PER_TAU_F
 
 
 @kernel
@@ -203,8 +204,8 @@ def _rate(x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def _physical(K_B: float, m: float = MASS, Jxx: float = JXX, Jyy: float = JYY, Jzz: float = JZZ) -> np.ndarray:
-    """p = m, Jxx, Jyy, Jzz, K_B, K_H and four zeros in place of the gust's entries."""
-    return np.array([m, Jxx, Jyy, Jzz, K_B, (A_CYC - K_B) / K_F, 0.0, 0.0, 0.0, 0.0])
+    """p = 1/m, 1/Jxx, 1/Jyy, 1/Jzz, K_B, K_H and four zeros in place of the gust's entries."""
+    return np.array([1 / m, 1 / Jxx, 1 / Jyy, 1 / Jzz, K_B, (A_CYC - K_B) / K_F, 0.0, 0.0, 0.0, 0.0])
 
 
 def trim(K_B: float = 0.84) -> tuple[np.ndarray, np.ndarray]:
