@@ -78,7 +78,7 @@ def step(f: Propagated, y: Array, H: Array, Q: Array, R: Array) -> RobustThreeSt
     V13 = f.E + V12 @ V23 - Kx @ S3
     x = x + times(V12, b) + times(V13, d)
     P = symmetric(Pxb + V12 @ Pb @ T(V12) + V13 @ Pd @ T(V13))
-    return RobustThreeStage(x, P, b + times(V23, d), d, Pb + V23 @ Pd @ T(V23), Pd)
+    return RobustThreeStage(x, P, b + times(V23, d), d, symmetric(Pb + V23 @ Pd @ T(V23)), Pd)
 
 
 def input_gain(f: Propagated, H: Array, Q: Array, R: Array) -> tuple[Array, Array]:
