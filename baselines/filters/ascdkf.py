@@ -65,7 +65,8 @@ def ascdkf(
     inputs, H = fault_inputs(plant, channels), linear_output(plant)
     n_x, p, q = len(plant.states), len(inputs.names), len(plant.disturbances)
     N = n_x + p + q
-    P0 = scipy.linalg.block_diag(initial_covariance(plant, x0_std), b0_std**2 * np.eye(p), d0_std**2 * np.eye(q))
+    P0x = initial_covariance(plant, x0_std)
+    P0 = np.asarray(scipy.linalg.block_diag(P0x, b0_std**2 * np.eye(p), d0_std**2 * np.eye(q)))
     Qa = scipy.linalg.block_diag(plant.Q, b_step**2 * np.eye(p), d_step**2 * np.eye(q))
     fault, dist = slice(n_x, n_x + p), slice(n_x + p, N)
     x0 = np.concatenate([plant.trim_state, np.zeros(p + q)])

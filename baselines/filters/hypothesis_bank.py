@@ -92,7 +92,8 @@ def hypothesis_bank(
     keep[:, b_part] = sets
 
     def blocks(x: Array, b: Array, d_std: float) -> Array:
-        return np.stack([scipy.linalg.block_diag(x, np.diag(b**2 * m), d_std**2 * np.eye(q)) for m in sets])
+        diagonal = [scipy.linalg.block_diag(x, np.diag(b**2 * m), d_std**2 * np.eye(q)) for m in sets]
+        return np.asarray(diagonal)
 
     P0 = blocks(initial_covariance(plant, x0_std), s0, d0_std)
     Qa = blocks(plant.Q, walk, d_step)

@@ -65,7 +65,8 @@ def watch(diagnoser: Diagnoser, plant: Plant, channels: tuple[str, ...], obs: Ar
     """Show the observations to a filter and read its state."""
     inputs = fault_inputs(plant, channels)
     n, samples, p = len(obs), obs.shape[1], len(channels)
-    found = Watched(*(np.full((n, samples - 1, width), np.nan) for width in (p, p, 2)), np.zeros((n, samples - 1, p), bool))
+    b, s, d = (np.full((n, samples - 1, width), np.nan) for width in (p, p, 2))
+    found = Watched(b, s, d, np.zeros((n, samples - 1, p), bool))
     _, sets = label_sets(plant, inputs)
     state = diagnoser.init(n)
     with np.errstate(all="ignore"):
@@ -167,7 +168,7 @@ def random_piece(kappa: float, name: str, count: int) -> dict[str, Any]:
     sets = faulty_steps(scenarios, steps, CHANNELS)
     faults = windows(scenarios, last, CHANNELS)
     waited = delays(w.on, faults)
-    right, healthy = (w.on == sets).all(axis=2), ~sets.any(axis=2)
+    right, healthy = (w.on == sets).all(axis=2), np.asarray(~sets.any(axis=2))
     first_right = first_none = single = 0
     for i, scenario in enumerate(scenarios):
         if len(scenario.faults) == 1 and scenario.faults[0].onset < last[i]:
@@ -328,7 +329,8 @@ def page(found: dict[str, Any]) -> str:
         piece = found[f"random-{kappa}-{name}"]
         rows.append([
             f"{kappa:g}", SHORT[name], t.cells(rmse, piece["rmse"], 2), t.cells(d, piece["d"], 1),
-            t.cells(accuracy, piece["accuracy"], 3), ", ".join(t.counts(r, f) for r, f in zip(detected, piece["detected"], strict=True)),
+            t.cells(accuracy, piece["accuracy"], 3),
+            ", ".join(t.counts(r, f) for r, f in zip(detected, piece["detected"], strict=True)),
             t.cells(delay, piece["delay"], 2), t.counts(first, piece["first"]), t.cell(false, piece["false_flights"], 2),
         ])  # fmt: skip
     head = ["kappa", "filter", "RMSE b col, lon, lat, ped [mrad]", "RMSE d [m/s]", "accuracy all, faulty, healthy",
@@ -339,8 +341,10 @@ def page(found: dict[str, Any]) -> str:
     parts.append(
         "Flags on a healthy channel in the same flights.\n\n" + markdown(["filter", "kappa 0", "0.3", "1"], rows) + "\n"
     )
-    rows = [[SHORT[name], *(t.counts(of, found[f"random-0.3-{name}"]["kinds"].get(kind, [0, 0])) for kind, of in kinds.items())]
-            for name, kinds in KINDS.items()]  # fmt: skip
+    rows = []
+    for name, kinds in KINDS.items():
+        ours = found[f"random-0.3-{name}"]["kinds"]
+        rows.append([SHORT[name], *(t.counts(of, ours.get(kind, [0, 0])) for kind, of in kinds.items())])
     parts.append(
         "Detected by kind of fault, kappa = 0.3.\n\n" + markdown(["filter", *next(iter(KINDS.values()))], rows) + "\n"
     )
@@ -375,8 +379,8 @@ def page(found: dict[str, Any]) -> str:
     lost = ", ".join(f"{found[f'random-{k}-three_stage_cdkf']['terminated']:.2f}" for k in (0.0, 0.3, 1.0))
     figures = "\n".join(f"![Scenario {n}](huav_hover_scenario_{n}.png)\n" for n in (1, 2, 3, 4))
     summary = (f"**{t.agree} of {t.total} compared figures agree to the reference's last digit.** Flights lost at "
-               f"kappa 0, 0.3, 1: {lost} (reference 0.08, 0.08, 0.14). A constant \"none\" is right for {flights['none']:.3f} of the samples "
-               "(0.650).\n")  # fmt: skip
+               f"kappa 0, 0.3, 1: {lost} (reference 0.08, 0.08, 0.14). A constant \"none\" is right for "
+               f"{flights['none']:.3f} of the samples (0.650).\n")  # fmt: skip
     return "\n".join([INTRODUCTION, summary, *parts, "## Estimated against true faults\n\n" + figures])
 
 

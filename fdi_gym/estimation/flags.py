@@ -114,6 +114,6 @@ def with_flags(
         std = np.zeros((n, len(plant.estimated)))
         std[:, inputs.estimated] = np.sqrt(np.einsum("npp->np", cov))
         theta = plant.estimate_target(inputs.theta(plant, b), u)
-        return (k + 1, s, flags), Diagnosis(flags.on.any(axis=1), label, theta, std)
+        return (k + 1, s, flags), Diagnosis(np.any(flags.on, axis=1), label, theta, std)
 
     return Diagnoser(init, update)

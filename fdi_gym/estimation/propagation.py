@@ -181,4 +181,4 @@ def trim_model(plant: Plant, inputs: FaultInputs) -> Propagated:
         0.0, plant.trim_state[None], np.eye(n_x)[None], plant.trim_command[None], zero,
         np.zeros((1, len(plant.disturbances))),
     )  # fmt: skip
-    return Propagated(*(None if part is None else part[0] for part in found))
+    return Propagated(found.x[0], found.P[0], found.D[0], None, found.B[0], found.E[0])

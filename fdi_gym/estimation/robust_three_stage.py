@@ -55,20 +55,19 @@ def step(f: Propagated, y: Array, H: Array, Q: Array, R: Array) -> RobustThreeSt
     """
     P_ = f.P + Q
     r = y - times(H, f.x)
-    # state stage
     PHt = P_ @ H.T
     C1 = H @ PHt + R
-    Kx = right_divide(PHt, C1)
+    S2, S3 = H @ f.B, H @ f.E
+    n_x, p = P_.shape[-1], S2.shape[-1]
+    divided = right_divide(np.concatenate([PHt, T(S2), T(S3)], axis=1), C1)  # one factorisation of C1 for all three
+    Kx, S2tC, S3tC = divided[:, :n_x], divided[:, n_x : n_x + p], divided[:, n_x + p :]
+    # state stage
     x, Pxb = f.x + times(Kx, r), P_ - Kx @ T(PHt)
     # fault stage: weighted least squares
-    S2 = H @ f.B
-    S2tC = right_divide(T(S2), C1)  # S2' C1^-1
     Pb = symmetric(np.linalg.inv(S2tC @ S2))
     Kb = Pb @ S2tC
     b = times(Kb, r)
     # disturbance stage: weighted least squares on what the fault leaves, S3' G with G = C1^-1 (I - S2 Kb)
-    S3 = H @ f.E
-    S3tC = right_divide(T(S3), C1)
     S3tG = S3tC - S3tC @ S2 @ Kb
     Pd = symmetric(np.linalg.inv(S3tG @ S3))
     d = times(Pd @ S3tG, r)
