@@ -78,8 +78,7 @@ def test_derivative_and_step_with_fault_and_gust(plant):
 def test_halving_the_step_divides_the_error_by_sixteen(plant):
     exact = dataclasses.replace(plant, substeps=256).propagate(0.0, X[None], U[None])
     errors = [
-        np.abs(dataclasses.replace(plant, substeps=m).propagate(0.0, X[None], U[None]) - exact).max()
-        for m in (4, 8, 16)
+        np.abs(dataclasses.replace(plant, substeps=m).propagate(0.0, X[None], U[None]) - exact).max() for m in (4, 8, 16)
     ]
     assert errors[0] / errors[1] == pytest.approx(16, rel=0.1)
     assert errors[1] / errors[2] == pytest.approx(16, rel=0.1)
@@ -92,9 +91,7 @@ def test_jacobians():
     assert moduli[:4] == pytest.approx(expected, abs=1e-8)
     assert np.abs(moduli[4:] - 1).max() < 5e-2  # a sevenfold defective eigenvalue, known to eps^(1/7) at best
     assert np.trace(Ad) == pytest.approx(7 + sum(expected).real, abs=1e-7)
-    assert Bd[2] == pytest.approx(
-        [-2.733340275385, 3.8197541e-06, -4.0654746580e-04, 2.2167354e-05], rel=1e-6, abs=1e-10
-    )
+    assert Bd[2] == pytest.approx([-2.733340275385, 3.8197541e-06, -4.0654746580e-04, 2.2167354e-05], rel=1e-6, abs=1e-10)
     assert Bd[3] == pytest.approx([0.2163488279513, 0, 8.742238225507, -0.4221394047206], rel=1e-9, abs=1e-9)
     assert Bd[4] == pytest.approx([0.02131076616647, 4.679667671881, 0, -0.03973828613812], rel=1e-9, abs=1e-9)
     assert Bd[5] == pytest.approx([-2.994577369745, 0, 0, 3.168819452379], rel=1e-9, abs=1e-9)
@@ -143,12 +140,8 @@ def test_noise_free_closed_loop(plant):
     assert x[250] == pytest.approx(x250, rel=1e-8)
     assert x[450] == pytest.approx(x450, rel=1e-8)
     # u_c,k is shown at sample k + 1
-    assert u[251] == pytest.approx(
-        (0.09494304573718, 0.000340296825687, -0.006897752494846, -0.0107317178522), rel=1e-8
-    )
-    assert u[451] == pytest.approx(
-        (0.09584091871712, -0.00625742284599, 0.002614035592682, 0.002867125444054), rel=1e-8
-    )
+    assert u[251] == pytest.approx((0.09494304573718, 0.000340296825687, -0.006897752494846, -0.0107317178522), rel=1e-8)
+    assert u[451] == pytest.approx((0.09584091871712, -0.00625742284599, 0.002614035592682, 0.002867125444054), rel=1e-8)
 
 
 def test_healthy_hover_without_gust_stays_at_trim(plant):
@@ -295,6 +288,18 @@ def test_hard_process_flies_the_full_coupling():
     scenario = easy.process("hard").sample(np.random.default_rng(0))
     assert scenario.physical == {"kappa": 1.0}
     assert np.array_equal(simulate(easy, [scenario]).obs, simulate(full, [scenario.replace(physical={})]).obs)
+
+
+def test_mismatch_changes_the_truth_and_not_the_model(plant):
+    changes = plant.perturb(np.random.default_rng(0), 0.05)
+    assert {
+        name: abs(value / nominal - 1) < 0.05
+        for (name, value), nominal in zip(changes.items(), (huav.MASS, huav.JXX, huav.JYY, huav.JZZ), strict=True)
+    } == dict.fromkeys(changes, True)
+    scenario = FaultScenario(plant=huav.ID, steps=200, physical=changes)
+    flown = simulate(plant, [scenario], [no_noise(plant, 200)])
+    assert 1e-3 < np.abs(flown.state[0, -1] - huav.X_TRIM).max() < 1  # another mass is held by another collective
+    assert not flown.terminated[0]
 
 
 def test_loss_of_control_terminates(plant):

@@ -20,44 +20,44 @@ from fdi_gym.simulation import simulate
 MRAD = 1e-3
 CALIBRATION_SEEDS = range(5000, 5100)
 
-# (plant, channels, kappa) -> filter -> J [mrad]
-TABLE: dict[tuple[str, tuple[str, ...], float], dict[str, tuple[float, ...]]] = {
-    ("HUAVHover", ("lon", "lat", "ped"), 0.0): {
+# (plant, channels, options: kappa, K_B) -> filter -> J [mrad]
+TABLE: dict[tuple[str, tuple[str, ...], tuple[float, ...]], dict[str, tuple[float, ...]]] = {
+    ("HUAVHover", ("lon", "lat", "ped"), (0.0, 0.84)): {
         "ascdkf": (0.793, 0.614, 1.843),
         "three_stage_cdkf": (0.793, 0.614, 1.842),
         "three_stage_ekf": (0.793, 0.614, 1.842),
         "robust_three_stage_cdkf": (0.531, 0.333, 1.267),
         "robust_three_stage_ekf": (0.531, 0.333, 1.267),
     },
-    ("HUAVHover", ("col", "lon", "lat", "ped"), 0.0): {
+    ("HUAVHover", ("col", "lon", "lat", "ped"), (0.0, 0.84)): {
         "ascdkf": (2.415, 0.793, 0.614, 2.476),
         "three_stage_cdkf": (2.412, 0.793, 0.614, 2.484),
         "three_stage_ekf": (2.412, 0.793, 0.614, 2.483),
         "robust_three_stage_cdkf": (5.190, 0.526, 0.363, 5.288),
         "robust_three_stage_ekf": (5.190, 0.526, 0.363, 5.288),
     },
-    ("HUAVHover", ("lon", "lat", "ped"), 0.3): {
+    ("HUAVHover", ("lon", "lat", "ped"), (0.3, 0.84)): {
         "ascdkf": (0.792, 0.616, 11.654),
         "three_stage_cdkf": (0.792, 0.616, 11.657),
         "three_stage_ekf": (0.792, 0.616, 11.657),
         "robust_three_stage_cdkf": (0.646, 0.333, 41.794),
         "robust_three_stage_ekf": (0.646, 0.333, 41.794),
     },
-    ("HUAVHover", ("col", "lon", "lat", "ped"), 0.3): {
+    ("HUAVHover", ("col", "lon", "lat", "ped"), (0.3, 0.84)): {
         "ascdkf": (2.684, 0.792, 0.617, 11.449),
         "three_stage_cdkf": (2.681, 0.792, 0.617, 11.441),
         "three_stage_ekf": (2.681, 0.792, 0.617, 11.441),
         "robust_three_stage_cdkf": (5.190, 0.643, 0.363, 42.409),
         "robust_three_stage_ekf": (5.189, 0.643, 0.363, 42.409),
     },
-    ("HUAVHover", ("lon", "lat", "ped"), 1.0): {
+    ("HUAVHover", ("lon", "lat", "ped"), (1.0, 0.84)): {
         "ascdkf": (0.791, 0.622, 21.877),
         "three_stage_cdkf": (0.791, 0.622, 21.863),
         "three_stage_ekf": (0.791, 0.622, 21.863),
         "robust_three_stage_cdkf": (1.395, 0.333, 141.685),
         "robust_three_stage_ekf": (1.395, 0.333, 141.686),
     },
-    ("HUAVHover", ("col", "lon", "lat", "ped"), 1.0): {
+    ("HUAVHover", ("col", "lon", "lat", "ped"), (1.0, 0.84)): {
         "ascdkf": (3.508, 0.791, 0.621, 21.808),
         "three_stage_cdkf": (3.505, 0.791, 0.621, 21.809),
         "three_stage_ekf": (3.505, 0.791, 0.621, 21.809),
@@ -97,7 +97,7 @@ def thresholds_for(plant: Plant, name: str, inputs: FaultInputs, given: Sequence
     """
     if given is not None:
         return given
-    rows: Any = TABLE.get((plant.id, inputs.names, plant.options.get("kappa", 0.0)), {})
+    rows: Any = TABLE.get((plant.id, inputs.names, tuple(plant.options.values())), {})
     if name not in rows:
         raise NotApplicableError(
             f"no calibrated thresholds of {name} for {plant.id} with {dict(plant.options)} and the channels "
