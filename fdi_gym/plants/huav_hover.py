@@ -297,9 +297,7 @@ def stuck(channel: str, position: float | None, onset: int, end: int | None = No
     return Fault(channel, kind, onset, [Abrupt(f"gain_{channel}", 0.0), place], end)
 
 
-def floating_square(
-    channel: str, value: float, other: float, period: float, onset: int, end: int | None = None
-) -> Fault:
+def floating_square(channel: str, value: float, other: float, period: float, onset: int, end: int | None = None) -> Fault:
     """u_true = value in the even half periods [s] since the onset, other in the odd ones, whatever is commanded."""
     wave = Square(f"offset_{channel}", float(value), float(other), float(period))
     return Fault(channel, "float_square", onset, [Abrupt(f"gain_{channel}", 0.0), wave], end)
@@ -433,19 +431,25 @@ def _processes() -> dict[str, FaultProcess]:
 # Declaration
 
 
+ACTIVITY = (0.0017, 0.0015, 0.0015, 0.0046)  # rad rms: the command about trim in the fault-free flights
+BANDS = ((3e-3, 6e-3), (1e-3, 3e-3), (1e-3, 3e-3), (4e-3, 8e-3))  # rad: small, medium, large
+
+
 def _size(theta: np.ndarray, c: int) -> np.ndarray:
     """Typical |b| [rad] under a fault: the error at trim, and with it the command's activity that a gain loses."""
     lost = 1 - theta[..., c]
     return np.hypot(theta[..., 4 + c] - lost * U_TRIM[c], lost * ACTIVITY[c])
 
 
-ACTIVITY = (0.0017, 0.0015, 0.0015, 0.0046)  # rad rms: the command about trim in the fault-free flights
-BANDS = ((3e-3, 6e-3), (1e-3, 3e-3), (1e-3, 3e-3), (4e-3, 8e-3))  # rad: small, medium, large
-
-
 def target(theta: np.ndarray, u: np.ndarray) -> np.ndarray:
     """The actuator error b = u_true - u_c (..., 4) under theta (..., 8) and the command u (..., 4)."""
     return (theta[..., :4] - 1.0) * u + theta[..., 4:]
+
+
+def prescribed_noise(rng: np.random.Generator, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Process noise w (steps, 11), then sensor noise v (steps + 1, 9): the benchmark's order of draws."""
+    w = rng.standard_normal((steps, 11)) * SIGMA_W
+    return w, rng.standard_normal((steps + 1, 9)) * SIGMA_V
 
 
 def _labels() -> tuple[Label, ...]:
@@ -524,9 +528,3 @@ def plant(*, kappa: float = 0.3, K_B: float = 0.84) -> Plant:
         noise=prescribed_noise, isolation_reward=np.eye(len(labels)) - 0.5 * wrongly,
         identification_reward=identification_reward,
     )  # fmt: skip
-
-
-def prescribed_noise(rng: np.random.Generator, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Process noise w (steps, 11), then sensor noise v (steps + 1, 9): the benchmark's order of draws."""
-    w = rng.standard_normal((steps, 11)) * SIGMA_W
-    return w, rng.standard_normal((steps + 1, 9)) * SIGMA_V
