@@ -293,7 +293,9 @@ def outside(t, x, r):
 def cluster(d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A and E (..., 3, 4) at gimbal angles d (..., 4)."""
     A, E = pyramid(*np.moveaxis(np.asarray(d, float), -1, 0))
-    return np.moveaxis(np.array(A), (0, 1), (-2, -1)), np.moveaxis(np.array(E), (0, 1), (-2, -1))
+    # contiguous: products of stacked matrices then round the same for one episode and for many
+    A, E = (np.ascontiguousarray(np.moveaxis(np.array(M), (0, 1), (-2, -1))) for M in (A, E))
+    return A, E
 
 
 def inertia(A: np.ndarray) -> np.ndarray:
@@ -362,7 +364,7 @@ def loss(unit: int, alpha: float, onset: int, end: int) -> Fault:
 
 
 class Ranges(NamedTuple):
-    """Uniform ranges of a fault window: onset and duration [s] (it ends 1 s before the horizon at the latest), severity."""
+    """Uniform ranges of a fault window: onset and duration [s] (it ends 1 s before the horizon at least), severity."""
 
     onset: tuple[float, float]
     duration: tuple[float, float]
