@@ -254,7 +254,7 @@ def test_mekf_jacobian_is_the_derivative_of_the_step():
     for fault_model in ("torque", "wheel"):
         plant = load_plant("CMGSatellite", fault_model=fault_model)
         q, w, d = np.array([[*Q_V, np.sqrt(0.86)]]), np.array([W]), np.array([DELTA])
-        f, r = np.array([[0.5, 1.0, 0.9, 0.7]]), R_K
+        f, r = np.array([[0.5, 1.0, 0.9, 0.7]]), 0.1 * R_K
         Phi = transition(q, w, d, f, r, fault_model == "wheel")[0]
 
         def after(e, plant=plant, q=q, w=w, d=d, f=f, r=r):
@@ -316,3 +316,38 @@ def test_other_plants_are_refused():
 def test_a_wrong_form_is_named(plant):
     with pytest.raises(ValueError, match="joint"):
         make_diagnoser("gaukf", plant, form="triple")
+
+
+def test_oracle_classifier_integrates_to_a_density(plant):
+    """Each label's evidence is a density of f_hat: for two units against the integral over the severities."""
+    from baselines.filters.cramer_rao_oracle import log_evidence
+
+    rng = np.random.default_rng(2)
+    B = 0.05 * rng.standard_normal((4, 4))
+    P, f_hat = B @ B.T + 0.01 * np.eye(4), np.array([0.7, 1.02, 0.95, 0.6])
+    alpha = np.linspace(0.1, 0.9, 801)
+    a, b = np.meshgrid(alpha, alpha)
+    gap = f_hat - np.stack([1 - a, np.ones_like(a), np.ones_like(a), 1 - b], axis=-1)
+    density = np.exp(-0.5 * np.einsum("abi,ij,abj->ab", gap, np.linalg.inv(P), gap)) / np.sqrt(
+        np.linalg.det(2 * np.pi * P)
+    )
+    expected = np.trapezoid(np.trapezoid(density, alpha), alpha) / 0.8**2
+    found = log_evidence(f_hat[None], P[None], 0.1, 0.9)[0, plant.label_of(frozenset({"CMG 1", "CMG 4"}))]
+    np.testing.assert_allclose(np.exp(found), expected, rtol=1e-4)
+
+
+def test_bound_on_the_slew(plant):
+    """Healthy slew at 45 dB, change at 40 s: sd 0.039-0.049, 0.0100-0.0102, 0.0038-0.0039 after 1, 3, 10 s."""
+    from baselines.filters.cramer_rao_oracle import cramer_rao_oracle
+
+    faults = [cmg.loss(0, 1e-9, 4000, 5000)]
+    scenario = FaultScenario(plant=cmg.ID, steps=5000, faults=faults, noise_seed=3)
+    oracle = cramer_rao_oracle(plant, scenarios=[scenario])
+    s, sd = oracle.init(1), {}
+    for k in range(5001):
+        s, _ = oracle.update(s, np.zeros((1, 22)))
+        if k in (4100, 4300, 5000):
+            sd[k] = np.sqrt(np.trace(s.P[0, 6:, 6:]) / 4)
+    assert 0.036 < sd[4100] < 0.052
+    assert sd[4300] == pytest.approx(0.0101, abs=0.0003)
+    assert sd[5000] == pytest.approx(0.00385, abs=0.0001)
