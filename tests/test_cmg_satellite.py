@@ -364,9 +364,7 @@ def test_losing_attitude_control_ends_the_flight():
     k = record.length[0]
     error = cmg.attitude_error(*record.state[0, k, :4], np.concatenate([cmg.slew(k * cmg.DT)[0], np.zeros(4)]))[3]
     assert 2 * np.degrees(np.arccos(abs(error))) > 60
-    before = cmg.attitude_error(
-        *record.state[0, k - 1, :4], np.concatenate([cmg.slew((k - 1) * cmg.DT)[0], np.zeros(4)])
-    )[3]
+    before = cmg.attitude_error(*record.state[0, k - 1, :4], np.concatenate([cmg.slew((k - 1) * cmg.DT)[0], np.zeros(4)]))[3]
     assert 2 * np.degrees(np.arccos(abs(before))) <= 60
 
 

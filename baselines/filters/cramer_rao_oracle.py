@@ -1,9 +1,9 @@
 """Cramer-Rao oracle: what could be known about the effectiveness by someone who is told when it changes.
 
-The covariance of a Kalman filter linearised on the true trajectory is the (posterior) Cramer-Rao bound of the model with
-Gaussian noise: f is known before the first change, and has the prior 0.25 I at each. The oracle draws an estimate from
-N(f, P_ff) every 0.1 s and asks for the most probable set of faulty units. It forgets at every change what it knew, so it
-is a reference point and not an upper bound.
+The covariance of a Kalman filter linearised on the true trajectory is the (posterior) Cramer-Rao bound of the model
+with Gaussian noise: f is known before the first change, and has the prior 0.25 I at each. The oracle draws an estimate
+from N(f, P_ff) every 0.1 s and asks for the most probable set of faulty units. It forgets at every change what it knew,
+so it is a reference point and not an upper bound.
 
 P. Tichavsky, C. H. Muravchik, A. Nehorai, IEEE Trans. Signal Processing 46(5), 1998 (bound); classifier: data sheet.
 """
@@ -55,7 +55,7 @@ def _log_between(a: Array, b: Array) -> Array:
 
 
 def log_evidence(f_hat: Array, P: Array, alpha_min: float, alpha_max: float) -> Array:
-    """log p(f_hat | the label's units have alpha U(alpha_min, alpha_max), the others f = 1): (n, 16) from f_hat (n, 4)."""
+    """log p(f_hat | label): its units have alpha U(alpha_min, alpha_max), the others f = 1; (n, 16) from f_hat (n, 4)."""
     found = np.empty((len(f_hat), len(SETS)))
     for label, faulty in enumerate(SETS):
         S, C = list(faulty), [i for i in range(4) if i not in faulty]
@@ -85,9 +85,7 @@ class Oracle(NamedTuple):
     episode: Array  # (n,) which of the scenarios
 
 
-@diagnoser(
-    "cramer_rao_oracle", "Cramer-Rao bound and best classifier, told when the effectiveness changes", clairvoyant=True
-)
+@diagnoser("cramer_rao_oracle", "Cramer-Rao bound and classifier, told when the effectiveness changes", clairvoyant=True)
 def cramer_rao_oracle(
     plant: Plant, *, scenarios: Sequence[FaultScenario], alpha_min: float = 0.02, alpha_max: float = 1.0
 ) -> Diagnoser:

@@ -276,7 +276,7 @@ def control(t, y, r, q, c, u):
     peak = max(max(abs(u[0]), abs(u[1])), max(abs(u[2]), abs(u[3])))
     if peak > R_MAX:
         for i in range(4):
-            u[i] *= R_MAX / peak
+            u[i] = u[i] / peak * R_MAX
 
 
 @kernel
@@ -418,9 +418,7 @@ def intermittent(rng: np.random.Generator, profile: str = "slew") -> FaultScenar
             duration, alpha = rng.uniform(4, 20), float(rng.uniform(0.02, 0.4))
             faults.append(loss(i, alpha, int(t / DT), min(int((t + duration) / DT), steps)))
             t += duration + rng.uniform(10, 40)
-    return FaultScenario(
-        plant=ID, steps=steps, faults=faults, reference={"profile": profile}, physical=perturb(rng, 0.01)
-    )
+    return FaultScenario(plant=ID, steps=steps, faults=faults, reference={"profile": profile}, physical=perturb(rng, 0.01))
 
 
 def tumble(rng: np.random.Generator) -> list[float]:
