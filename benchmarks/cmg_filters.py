@@ -115,7 +115,9 @@ def main(arguments: Arguments) -> None:
     for count in (1, n):
         flight = np.repeat(record.obs[:, :301], count, axis=0)
         ours[count] = best(filter_run("joint_ukf", flight)) / 300 / count
-    reference = filter_run("joint_ukf", record.obs[:, :101])()[0]
+    found = filter_run("joint_ukf", record.obs[:, :101])()
+    assert found is not None
+    reference = found[0]
     for compiled, steps in ((True, 100), (False, 20)):
         ukf = filterpy_filter(plant, y[0], compiled)
         begun = time.process_time()

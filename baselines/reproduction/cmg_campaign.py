@@ -105,6 +105,7 @@ def watch(plant: Plant, scenarios: list[FaultScenario], record: Record, method: 
     for k in range(samples):
         state, said = diagnoser.update(state, record.obs[:, k])
         theta[:, k], label[:, k] = said.theta, said.mode
+        assert said.theta_std is not None
         sd[:, k] = np.sqrt((said.theta_std**2).mean(axis=1))
         inner = state[0]
         if hasattr(inner, "beta"):
@@ -192,7 +193,7 @@ def hard_outcome(plant: Plant, scenario: FaultScenario, record: Record, said: Wa
     return {
         "sample": float(right[scored].mean()), "wide": float(wide[scored].mean()),
         "faulty": float(right[faulty].mean()) if faulty.any() else None,
-        "segment": float(np.mean(segments)), "at_end": float(np.mean(at_end)), "rmse": rmse(error[500:]),
+        "segment": float(np.mean(segments)), "at_end": float(np.mean(at_end)), "rmse": rmse(error[scored]),
         "sd": float(said.sd[i, 500 : K + 1].mean()), "changes": int(change.sum()),
         "none": float((truth[scored] == 0).mean()), "det": float(cmg.singularity(record.state[i, :, 7:]).min()),
         "steps": int(said.filter_steps[i]),
@@ -237,7 +238,7 @@ def main(
     episodes: int = 20,
     level: float = 0.01,
     workers: int = -1,
-    work: Path = Path(".reproduction/cmg_satellite"),
+    work: Path = Path("runs/reproduction-cmg"),
 ) -> None:
     """Run a campaign and print its accuracy.
 
