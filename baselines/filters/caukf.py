@@ -27,6 +27,7 @@ def caukf(
     inc: float = INC_JOINT,
     beta_0: float = BETA_0,
     q_theta: float = Q_THETA,
+    sigma_r: float | None = None,
     threshold: float = THRESHOLD,
     n_pass: int = 1,
 ) -> Diagnoser:
@@ -40,4 +41,4 @@ def caukf(
         raise ValueError(f"unknown form {form!r}; there are joint, dual")
     build, first = (joint_filter, N_XI) if form == "joint" else (dual_filter, 0)
     search = element_grid(first + np.arange(4), inc)
-    return build(plant, search, beta_0=beta_0, q_theta=q_theta, threshold=threshold, n_pass=n_pass)
+    return build(plant, search, beta_0=beta_0, q_theta=q_theta, sigma_r=sigma_r, threshold=threshold, n_pass=n_pass)

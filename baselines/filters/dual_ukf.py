@@ -85,6 +85,7 @@ def dual_filter(
     q_theta: float = Q_THETA,
     sigma_q: float = SIGMA_Q,
     p_theta: float = P_THETA,
+    sigma_r: float | None = None,
     threshold: float = THRESHOLD,
     n_pass: int = 1,
     eps_r: float = EPS_R,
@@ -92,7 +93,7 @@ def dual_filter(
     """The dual filter as a diagnoser, with a search that adapts the parameter filter's covariance, or none."""
     require_attitude(plant)
     Q, Q_f = sigma_q**2 * np.eye(N_XI), q_theta * np.eye(4)
-    R = plant.R[:N_XI, :N_XI]
+    R = plant.R[:N_XI, :N_XI] if sigma_r is None else sigma_r**2 * np.eye(N_XI)
     r_inv = 1.0 / np.diag(R)[:N_SEEN]
     decide = threshold_rule(plant, threshold)
 
@@ -139,6 +140,7 @@ def dual_ukf(
     q_theta: float = Q_THETA,
     sigma_q: float = SIGMA_Q,
     p_theta: float = P_THETA,
+    sigma_r: float | None = None,
     threshold: float = THRESHOLD,
 ) -> Diagnoser:
     """The dual filter without adaptation; arguments as in `joint_ukf`.
@@ -146,4 +148,4 @@ def dual_ukf(
     Raises:
         NotApplicableError: The plant has no attitude.
     """
-    return dual_filter(plant, q_theta=q_theta, sigma_q=sigma_q, p_theta=p_theta, threshold=threshold)
+    return dual_filter(plant, q_theta=q_theta, sigma_q=sigma_q, p_theta=p_theta, sigma_r=sigma_r, threshold=threshold)

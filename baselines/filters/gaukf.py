@@ -35,6 +35,7 @@ def gaukf(
     inc: float = INC_JOINT,
     beta_0: float = BETA_0,
     q_theta: float = Q_THETA,
+    sigma_r: float | None = None,
     threshold: float = THRESHOLD,
     n_pass: int = 1,
 ) -> Diagnoser:
@@ -46,6 +47,7 @@ def gaukf(
         inc: Increment of a variance.
         beta_0: Threshold of the fault flag.
         q_theta: Variance that each effectiveness gains per step.
+        sigma_r: Standard deviation of all ten sensors that the filter believes in (the source: 1e-4). None: the true ones.
         threshold: A unit that has lost more is called faulty.
         n_pass: Passes of the search per step.
 
@@ -57,4 +59,4 @@ def gaukf(
         raise ValueError(f"unknown form {form!r}; there are joint, dual")
     build, first = (joint_filter, N_XI) if form == "joint" else (dual_filter, 0)
     search = binary_grid(first + np.arange(UNITS), inc, all_subsets)
-    return build(plant, search, beta_0=beta_0, q_theta=q_theta, threshold=threshold, n_pass=n_pass)
+    return build(plant, search, beta_0=beta_0, q_theta=q_theta, sigma_r=sigma_r, threshold=threshold, n_pass=n_pass)

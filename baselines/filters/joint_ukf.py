@@ -74,6 +74,7 @@ def joint_filter(
     q_theta: float = Q_THETA,
     sigma_q: float = SIGMA_Q,
     p_theta: float = P_THETA,
+    sigma_r: float | None = None,
     threshold: float = THRESHOLD,
     n_pass: int = 1,
     eps_r: float = EPS_R,
@@ -81,7 +82,7 @@ def joint_filter(
     """The joint filter as a diagnoser, with a search that adapts its covariance, or none."""
     require_attitude(plant)
     Q = np.diag([sigma_q**2] * N_XI + [q_theta] * 4)
-    R = plant.R[:N_XI, :N_XI]
+    R = plant.R[:N_XI, :N_XI] if sigma_r is None else sigma_r**2 * np.eye(N_XI)
     r_inv = 1.0 / np.diag(R)[:N_SEEN]
     P_0 = np.diag([*np.diag(R), *[p_theta] * 4])
     decide = threshold_rule(plant, threshold)
@@ -125,6 +126,7 @@ def joint_ukf(
     q_theta: float = Q_THETA,
     sigma_q: float = SIGMA_Q,
     p_theta: float = P_THETA,
+    sigma_r: float | None = None,
     threshold: float = THRESHOLD,
 ) -> Diagnoser:
     """The joint filter without adaptation.
@@ -134,9 +136,10 @@ def joint_ukf(
         q_theta: Variance that each effectiveness gains per step.
         sigma_q: Process noise of the other ten states, per step.
         p_theta: Initial variance of each effectiveness.
+        sigma_r: Standard deviation of all ten sensors that the filter believes in (the source: 1e-4). None: the true ones.
         threshold: A unit that has lost more is called faulty.
 
     Raises:
         NotApplicableError: The plant has no attitude.
     """
-    return joint_filter(plant, q_theta=q_theta, sigma_q=sigma_q, p_theta=p_theta, threshold=threshold)
+    return joint_filter(plant, q_theta=q_theta, sigma_q=sigma_q, p_theta=p_theta, sigma_r=sigma_r, threshold=threshold)

@@ -38,6 +38,7 @@ def sgaukf(
     inc: float = INC_JOINT,
     beta_0: float = BETA_0,
     q_theta: float = Q_THETA,
+    sigma_r: float | None = None,
     threshold: float = THRESHOLD,
     n_pass: int = 1,
 ) -> Diagnoser:
@@ -47,7 +48,7 @@ def sgaukf(
         plant: The satellite.
         form: "joint" or "dual".
         parity: "alternating" or "odd".
-        inc, beta_0, q_theta, threshold, n_pass: As in `gaukf`.
+        inc, beta_0, q_theta, sigma_r, threshold, n_pass: As in `gaukf`.
 
     Raises:
         NotApplicableError: The plant has no attitude.
@@ -62,4 +63,4 @@ def sgaukf(
 
     build, first = (joint_filter, N_XI) if form == "joint" else (dual_filter, 0)
     search = binary_grid(first + np.arange(4), inc, choices)
-    return build(plant, search, beta_0=beta_0, q_theta=q_theta, threshold=threshold, n_pass=n_pass)
+    return build(plant, search, beta_0=beta_0, q_theta=q_theta, sigma_r=sigma_r, threshold=threshold, n_pass=n_pass)

@@ -26,7 +26,7 @@ from fdi_gym.simulation import Record, simulate
 METHODS = {
     "UKF": "joint_ukf", "CAUKF": "caukf", "GAUKF": "gaukf", "SGAUKF": "sgaukf", "SGAUKF-odd": "sgaukf_odd",
     "dual GAUKF": "dual_gaukf", "dual SGAUKF": "dual_sgaukf", "MEKF": "mekf", "CLAIR": "mekf_clairvoyant",
-    "oracle": "cramer_rao_oracle",
+    "oracle": "cramer_rao_oracle", "GAUKF, sigma_R 1e-4": "gaukf", "SGAUKF, sigma_R 1e-4": "sgaukf",
 }  # fmt: skip
 # what the oracle is told of the severities
 ALPHA = {"bench": (0.1, 0.9), "table5": (0.0, 1.0), "table4": (0.5, 0.9), "hard": (0.02, 0.4)}
@@ -47,7 +47,7 @@ class Piece(NamedTuple):
     def name(self) -> str:
         """Its file."""
         level = f"-{self.level:g}" if self.variant in ("hard", "severity") else ""
-        method = METHODS[self.method]
+        method = METHODS[self.method] + ("-sigma_r" if "sigma_R" in self.method else "")
         return f"{self.variant}{level}-{self.reference}-{self.snr}-{method}-{self.block:03d}"
 
 
@@ -205,7 +205,7 @@ def run_piece(p: Piece) -> dict[str, Any]:
     """Fly and diagnose a block: {"outcomes": one per episode, "seconds": of the filter}."""
     plant = load_plant(cmg.ID, reference=p.reference, snr=p.snr)
     scenarios = scenarios_of(p)
-    tuning: dict[str, Any] = {}
+    tuning: dict[str, Any] = {"sigma_r": 1e-4} if "sigma_R" in p.method else {}
     if p.method == "oracle":
         low, high = (max(p.level - 0.005, 0.0), p.level + 0.005) if p.variant == "severity" else ALPHA[p.variant]
         tuning = {"alpha_min": low, "alpha_max": high}

@@ -33,6 +33,11 @@ TABLE_4_SLEW = {
     "MEKF": {45: (0.0028, 0.0404, 0.0258, 96.6), 55: (0.0029, 0.0346, 0.0184, 97.4), 75: (0.0032, 0.0274, 0.0106, 98.4)},
     "CLAIR": {45: (0.0028, 0.0317, 0.0150, 97.9), 55: (0.0029, 0.0233, 0.0084, 98.8), 75: (0.0032, 0.0183, 0.0091, 99.2)},
 }
+# faulty and post with the source's R = (1e-4)^2 I in place of the true one
+TABLE_4_SIGMA_R = {
+    "GAUKF, sigma_R 1e-4": {75: (0.0498, 0.0297), 45: (None, None)},
+    "SGAUKF, sigma_R 1e-4": {75: (0.0498, 0.0269), 45: (None, None)},
+}
 TABLE_4_STEPS = {45: {"CAUKF": 27542, "GAUKF": 23040, "SGAUKF": 20900}, 55: {"CAUKF": 24571, "GAUKF": 21872, "SGAUKF": 20668},
                  75: {"CAUKF": 23877, "GAUKF": 21664, "SGAUKF": 20736}}  # fmt: skip
 TABLE_4_REGULATE = {45: (0.001, 0.424, 0.011), 75: (0.006, 0.427, 0.007)}  # every method alike: the flag never rises
