@@ -286,6 +286,7 @@ def evaluate(function_at, t, x, u, theta, d, p, out):
         M,
         V,
         V,
+        int64,
         M,
         M,
         M,
@@ -315,6 +316,7 @@ def simulate(
     sensor_range,
     p,
     nominal,
+    true_feedback,
     X,
     OBS,
     TH,
@@ -335,7 +337,8 @@ def simulate(
     steps, n = w.shape
     p_theta, n_y, n_u = TH.shape[1], v.shape[1], u0.size
     n_n = OBS.shape[1] - n_y - n_u
-    x, u, c, y, out = x0.copy(), u0.copy(), c0.copy(), np.empty(n_y), np.empty(n_n)
+    x, u, c, out = x0.copy(), u0.copy(), c0.copy(), np.empty(n_n)
+    y, fed = np.empty(n_y), np.empty(n_y)
     ak, bk, gk, theta = np.empty(p_theta), np.empty(p_theta), np.empty(p_theta), np.empty(p_theta)
     rk, dk, held = np.empty(r.shape[1]), np.empty(d.shape[1]), np.zeros(holds.shape[0])
     k1, k2, k3, k4, z, last = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
@@ -361,14 +364,16 @@ def simulate(
             theta[j] = ak[j] + bk[j]
         output(t, x, u, theta, dk, p, y)
         for i in range(n_y):
+            fed[i] = y[i]
             y[i] = min(max(y[i] + v[k, i], sensor_range[0, i]), sensor_range[1, i])
             OBS[k, i] = y[i]
+            fed[i] = fed[i] if true_feedback else y[i]
         known(t, rk, c, out)
         for i in range(n_n):
             OBS[k, n_y + n_u + i] = out[i]
         if k == steps or ended:
             return -k if ended else k
-        control(t, y, rk, q, c, u)
+        control(t, fed, rk, q, c, u)
         for i in range(n_u):
             OBS[k + 1, n_y + i] = u[i]
         for h in range(holds.shape[0]):
