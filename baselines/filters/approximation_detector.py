@@ -38,6 +38,7 @@ NU_0 = np.array([2e-5, 2e-3])  # rad, rad/s: numerical floor
 class Detector(NamedTuple):
     """The estimator at sample k, everything from y_k."""
 
+    begun: Array  # (n,) bool: has seen its first sample
     eps: Array  # (n, 2) residual y - xhat [rad, rad/s]
     threshold: Array  # (n, 2)
     nu: Array  # (n, 2) the noise margin in it
@@ -64,28 +65,30 @@ def noise_input(sample: Sample, sigma: Array) -> Array:
     return np.stack([(G + A11) ** 2 * variance[0] + variance[1], A21**2 * variance[0] + G**2 * variance[1]], axis=-1)
 
 
-def advance(before: Detector | None, sample: Sample, sigma: Array, margin: bool = True) -> Detector:
-    """The estimator one sample later; `before` is None at k = 0. sigma (2,): noise of alpha and q."""
-    y, phi = sample.y, basis(sample.alpha)
-    W = np.zeros_like(phi) if before is None else before.W
-    fhat = np.einsum("nj,nj->n", W, phi)
+def start(n: int) -> Detector:
+    """The estimator before its first sample."""
+    none, pair = np.zeros(n, bool), np.zeros((n, 2))
+    return Detector(none, pair, pair, pair, np.zeros(n), none, pair, pair, pair, pair, pair, pair,
+                    np.zeros((n, CENTRES.size)))  # fmt: skip
+
+
+def advance(before: Detector, sample: Sample, sigma: Array, margin: bool = True) -> Detector:
+    """The estimator one sample later. sigma (2,): noise of alpha and q."""
+    y, phi, first = sample.y, basis(sample.alpha), ~before.begun[:, None]
+    fhat = np.einsum("nj,nj->n", before.W, phi)
     s = G * y + model.xi(*sample)
     s[:, 1] += fhat
     bound = model.uncertainty_bound(sample.alpha, sample.mach)
-    if before is None:
-        xhat, integral, v = y, np.zeros_like(y), np.tile(sigma**2, (len(y), 1))
-        alarm = np.zeros(len(y), bool)
-    else:
-        xhat = A * before.xhat + B0 * before.s + B1 * s
-        integral = A * before.integral + B0 * before.bound + B1 * bound
-        v = A**2 * before.v + (B0 + B1) ** 2 * before.w
-        alarm = before.alarm
+    xhat = np.where(first, y, A * before.xhat + B0 * before.s + B1 * s)
+    integral = np.where(first, 0.0, A * before.integral + B0 * before.bound + B1 * bound)
+    v = np.where(first, sigma**2, A**2 * before.v + (B0 + B1) ** 2 * before.w)
     nu = NOISE_FACTOR * np.sqrt(sigma**2 + v) + NU_0 if margin else np.tile(NU_0, (len(y), 1))
     eps, threshold = y - xhat, integral + nu
     dead = np.where(np.abs(eps[:, 1]) <= threshold[:, 1], 0.0, eps[:, 1])
-    W = np.clip(W + DT * GAMMA * phi * dead[:, None], -W_MAX, W_MAX)
-    alarm = alarm | (np.abs(eps) > threshold).any(axis=1)
-    return Detector(eps, threshold, nu, fhat, alarm, xhat, s, bound, integral, v, noise_input(sample, sigma), W)
+    W = np.clip(before.W + DT * GAMMA * phi * dead[:, None], -W_MAX, W_MAX)
+    alarm = before.alarm | (np.abs(eps) > threshold).any(axis=1)
+    return Detector(np.ones_like(alarm), eps, threshold, nu, fhat, alarm, xhat, s, bound, integral, v,
+                    noise_input(sample, sigma), W)  # fmt: skip
 
 
 def sensor_sigma(plant: Plant) -> Array:
@@ -108,12 +111,8 @@ def approximation_detector(plant: Plant, *, margin: bool = True) -> Diagnoser:
     model.require_missile(plant, "the detection and approximation estimator")
     sigma = sensor_sigma(plant)
 
-    def init(n: int) -> tuple[Detector | None, Array]:
-        return None, np.zeros(n, np.int64)
-
-    def update(state: tuple[Detector | None, Array], obs: Array) -> tuple[tuple[Detector, Array], Diagnosis]:
-        before, none = state
+    def update(before: Detector, obs: Array) -> tuple[Detector, Diagnosis]:
         detector = advance(before, model.read(plant, obs), sigma, margin)
-        return (detector, none), Diagnosis(detector.alarm, none)
+        return detector, Diagnosis(detector.alarm, np.zeros(len(obs), np.int64))
 
-    return Diagnoser(init, update)
+    return Diagnoser(start, update)

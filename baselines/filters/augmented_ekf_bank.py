@@ -75,14 +75,14 @@ def augmented_ekf_bank(
     model.require_missile(plant, "the augmented filter bank")
     R = plant.R[:2, :2]
 
-    def init(n: int) -> tuple[Filters | None, Ratios]:
+    def init(n: int) -> tuple[Filters, Ratios]:
         count = np.zeros(n, np.int64)
-        return None, Ratios(np.zeros((n, 6)), count, count, count, np.zeros(n, bool))
+        return ekf.start(n), Ratios(np.zeros((n, 6)), count, count, count, np.zeros(n, bool))
 
-    def update(state: tuple[Filters | None, Ratios], obs: Array) -> tuple[tuple[Filters, Ratios], Diagnosis]:
+    def update(state: tuple[Filters, Ratios], obs: Array) -> tuple[tuple[Filters, Ratios], Diagnosis]:
         filters, ratios = state
         sample = model.read(plant, obs)
-        filters = ekf.update(ekf.start(sample, R) if filters is None else ekf.predict(filters, sample), R)
+        filters = ekf.update(ekf.predict_or_begin(filters, sample, ekf.at_first_sample(sample, R)), R)
         ratios = decide(ratios, filters.log_likelihood, forgetting, threshold, alarm_after, release, release_after)
         mode = np.where(ratios.alarm, ratios.candidate, 0)
         return (filters, ratios), Diagnosis(ratios.alarm, mode, *ekf.declared_theta(filters, mode))

@@ -129,10 +129,10 @@ def gos(plant: Plant, *, classes: tuple[int, ...] = (1, 2, 3, 4, 5), strict: boo
         raise ValueError(f"classes are labels in 1..5, not {classes}")
     sigma = detection.sensor_sigma(plant)
 
-    def init(n: int) -> tuple[Detector | None, Bank]:
-        return None, start(n, len(classes))
+    def init(n: int) -> tuple[Detector, Bank]:
+        return detection.start(n), start(n, len(classes))
 
-    def update(state: tuple[Detector | None, Bank], obs: Array) -> tuple[tuple[Detector, Bank], Diagnosis]:
+    def update(state: tuple[Detector, Bank], obs: Array) -> tuple[tuple[Detector, Bank], Diagnosis]:
         sample = model.read(plant, obs)
         detector = detection.advance(state[0], sample, sigma)
         bank = advance(state[1], detector, sample, classes)

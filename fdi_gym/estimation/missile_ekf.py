@@ -26,13 +26,23 @@ SIGMA_RHO = 0.05 / np.sqrt(3)  # a uniform error of 5 %
 class Filters(NamedTuple):
     """The six filters at sample k, after the update."""
 
+    begun: Array  # (n,) bool: has seen its first sample
     z: Array  # (n, 6, 6)
     P: Array  # (n, 6, 6, 6)
     log_likelihood: Array  # (n, 6) of y_k, without its constant
     sample: Sample  # at k, for the next prediction
 
 
-def start(sample: Sample, R: Array, sigma_theta: Array = SIGMA_THETA, sigma_rho: float = SIGMA_RHO) -> Filters:
+def start(n: int) -> Filters:
+    """The filters before their first sample."""
+    nothing = np.zeros(n)
+    return Filters(np.zeros(n, bool), np.zeros((n, 6, 6)), np.zeros((n, 6, 6, 6)), np.zeros((n, 6)),
+                   Sample(nothing, nothing, nothing, nothing, nothing))  # fmt: skip
+
+
+def at_first_sample(
+    sample: Sample, R: Array, sigma_theta: Array = SIGMA_THETA, sigma_rho: float = SIGMA_RHO
+) -> Filters:
     """The filters at k = 0, before the update: at the measurement. R (2, 2)."""
     z = np.zeros((len(sample.alpha), 6, 6))
     z[..., :2] = sample.y[:, None, :]
@@ -40,7 +50,7 @@ def start(sample: Sample, R: Array, sigma_theta: Array = SIGMA_THETA, sigma_rho:
     P[..., :2, :2] = R
     P[..., 2, 2] = sigma_theta**2
     P[..., [3, 4, 5], [3, 4, 5]] = sigma_rho**2
-    return Filters(z, P, np.zeros(z.shape[:2]), sample)
+    return Filters(np.ones(len(z), bool), z, P, np.zeros(z.shape[:2]), sample)
 
 
 def rates(z: Array, sample: Sample) -> tuple[Array, Array]:
@@ -83,7 +93,18 @@ def predict(filters: Filters, sample: Sample) -> Filters:
     P[..., 0, 0] += (DT * ((0.577 * bound) ** 2 * 0.5 + 1e-8))[:, None]
     P[..., 1, 1] += DT * 1e-5
     P[..., 2, 2] += DT * Q_THETA
-    return Filters(z, P, filters.log_likelihood, sample)
+    return Filters(filters.begun, z, P, filters.log_likelihood, sample)
+
+
+def predict_or_begin(filters: Filters, sample: Sample, initial: Filters) -> Filters:
+    """`predict`, or where an episode sees its first sample the initial filters."""
+    predicted, begun = predict(filters, sample), filters.begun
+    if begun.all():
+        return predicted
+    return initial._replace(
+        z=np.where(begun[:, None, None], predicted.z, initial.z),
+        P=np.where(begun[:, None, None, None], predicted.P, initial.P),
+    )
 
 
 def update(filters: Filters, R: Array) -> Filters:
@@ -100,7 +121,7 @@ def update(filters: Filters, R: Array) -> Filters:
     z = z + (PHt @ white[..., None])[..., 0]
     z[..., 2] = np.clip(z[..., 2], THETA_MIN, THETA_MAX)
     P = symmetric(P - PHt @ S_inv @ T(PHt))
-    return Filters(z, P, -0.5 * ((v * white).sum(axis=-1) + np.log(det)), sample)
+    return Filters(filters.begun, z, P, -0.5 * ((v * white).sum(axis=-1) + np.log(det)), sample)
 
 
 def declared_theta(filters: Filters, mode: Array) -> tuple[Array, Array]:
