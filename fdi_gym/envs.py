@@ -312,9 +312,7 @@ class FDIVectorEnv(VectorEnv):
         if mask is None:
             mask = np.ones(self.num_envs, dtype=bool)
         elif not isinstance(mask, np.ndarray) or mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
-            raise ValueError(
-                f"reset_mask is a bool array of shape ({self.num_envs},) with at least one True, not {mask!r}"
-            )
+            raise ValueError(f"reset_mask is a bool array of shape ({self.num_envs},) with at least one True, not {mask!r}")
         elif self._record is None and not mask.all():
             raise ValueError("the first reset begins an episode in every environment: no reset_mask yet")
         for i in np.flatnonzero(mask):
@@ -357,9 +355,7 @@ class FDIVectorEnv(VectorEnv):
         if begin.size and self._mode is AutoresetMode.DISABLED:
             raise RuntimeError(f"episodes {begin.tolist()} are over: reset them with options={{'reset_mask': ...}}")
         k = self._k
-        reward = np.asarray(
-            self._game.reward(checked, record.label[self._slots, k], record.target[self._slots, k]), float
-        )
+        reward = np.asarray(self._game.reward(checked, record.label[self._slots, k], record.target[self._slots, k]), float)
         reward = np.where((k == 0) | self._over, 0.0, reward)
         if self.render_mode is not None:
             for i in np.flatnonzero(~self._over):

@@ -316,7 +316,7 @@ def simulate(
     p,
     nominal,
     X,
-    O,
+    OBS,
     TH,
 ):
     """One closed-loop flight of K = len(w) samples. THE order of operations in a step is written here and nowhere else.
@@ -324,7 +324,7 @@ def simulate(
     At sample k: the sensors give y_k; what else is known gives n_k; the controller computes u_k, held until k + 1;
     entries of theta that a hold fault owns take their value; the plant advances to X[k+1] under TH[k+1], the fault
     parameter that acts over [k, k+1) (its value at the interval's end); process noise is added.
-    The observation is O[k] = [y_k, u_{k-1}, n_k]. u_{-1} is the trim command and TH[0] the nominal parameter: no
+    The observation is OBS[k] = [y_k, u_{k-1}, n_k]. u_{-1} is the trim command and TH[0] the nominal parameter: no
     interval has ended before sample 0.
 
     `holds` has the rows (theta entry, first step, end step, command index, lag): from the first step on the entry holds
@@ -334,7 +334,7 @@ def simulate(
     known, project, outside = _known_at(known_at), _project_at(project_at), _outside_at(outside_at)
     steps, n = w.shape
     p_theta, n_y, n_u = TH.shape[1], v.shape[1], u0.size
-    n_n = O.shape[1] - n_y - n_u
+    n_n = OBS.shape[1] - n_y - n_u
     x, u, c, y, out = x0.copy(), u0.copy(), c0.copy(), np.empty(n_y), np.empty(n_n)
     ak, bk, gk, theta = np.empty(p_theta), np.empty(p_theta), np.empty(p_theta), np.empty(p_theta)
     rk, dk, held = np.empty(r.shape[1]), np.empty(d.shape[1]), np.zeros(holds.shape[0])
@@ -342,7 +342,7 @@ def simulate(
     for j in range(p_theta):
         TH[0, j] = nominal[j]
     for i in range(n_u):
-        O[0, n_y + i] = u[i]
+        OBS[0, n_y + i] = u[i]
     for i in range(n):
         X[0, i] = x[i]
     ended = False
@@ -362,18 +362,18 @@ def simulate(
         output(t, x, u, theta, dk, p, y)
         for i in range(n_y):
             y[i] = min(max(y[i] + v[k, i], sensor_range[0, i]), sensor_range[1, i])
-            O[k, i] = y[i]
+            OBS[k, i] = y[i]
         known(t, rk, c, out)
         for i in range(n_n):
-            O[k, n_y + n_u + i] = out[i]
+            OBS[k, n_y + n_u + i] = out[i]
         if k == steps or ended:
             return -k if ended else k
         control(t, y, rk, q, c, u)
         for i in range(n_u):
-            O[k + 1, n_y + i] = u[i]
+            OBS[k + 1, n_y + i] = u[i]
         for h in range(holds.shape[0]):
             if holds[h, 1] == k:
-                held[h] = O[max(k + 1 - holds[h, 4], 0), n_y + holds[h, 3]]
+                held[h] = OBS[max(k + 1 - holds[h, 4], 0), n_y + holds[h, 3]]
                 ak[holds[h, 0]] = held[h]
         for i in range(n):
             last[i] = x[i]

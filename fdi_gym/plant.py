@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
+import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -90,7 +91,7 @@ def squared_error(scale: Sequence[float]) -> Callable[[Array], Array]:
     weight = 1.0 / np.asarray(scale, float) ** 2
 
     def reward(error: Array) -> Array:
-        return -(error**2 @ weight)
+        return -(error**2 * weight).sum(axis=-1)  # not a matrix product: the same bits for one as for many
 
     return reward
 
@@ -101,9 +102,7 @@ def _no_rows(scenario: FaultScenario) -> Array:
 
 def _no_change(physical: Mapping[str, Any]) -> Array:
     if physical:
-        raise ValueError(
-            f"this plant has no physical parameters to change, but the scenario sets {', '.join(physical)}"
-        )
+        raise ValueError(f"this plant has no physical parameters to change, but the scenario sets {', '.join(physical)}")
     return np.zeros(0)
 
 
@@ -243,7 +242,7 @@ class Plant:
         rows = np.zeros(scenario.steps + 1, dtype=np.int64)
         ends = [scenario.steps if f.end is None else min(f.end, scenario.steps) for f in scenario.faults]
         edges = sorted({0, scenario.steps, *(min(f.onset, scenario.steps) for f in scenario.faults), *ends})
-        for start, stop in zip(edges[:-1], edges[1:], strict=True):
+        for start, stop in itertools.pairwise(edges):
             active = frozenset(f.mode for f, end in zip(scenario.faults, ends, strict=True) if f.onset <= start < end)
             rows[start + 1 : stop + 1] = self.label_of(active)
         return rows
@@ -263,6 +262,24 @@ class Plant:
         if name not in self.processes:
             raise ValueError(f"unknown scenario {name!r}; {self.id} has {', '.join(self.processes)}")
         return self.processes[name]
+
+    def describe(self) -> str:
+        """The data sheet as text: spaces, bounds, units, fault modes, labels, processes."""
+        lines = [f"{self.env_id}: {self.description}", f"options: {dict(self.options)}", f"sample time: {self.dt} s"]
+        for title, signals in (
+            ("observation", self.observed), ("estimated (identification action)", self.estimated),
+            ("fault parameter theta", self.theta), ("disturbances", self.disturbances),
+        ):  # fmt: skip
+            if signals:
+                lines.append(f"\n{title}")
+            lines += [f"  {s.name:20s} {s.unit:8s} [{s.low:g}, {s.high:g}]  scale {s.scale:g}" for s in signals]
+        lines.append("\nlabels (isolation action)")
+        lines += [f"  {i:2d} {label.name}" for i, label in enumerate(self.labels)]
+        lines.append("\nfault modes")
+        lines += [f"  {mode.name:20s} {mode.description}" for mode in self.modes]
+        lines.append("\nscenarios")
+        lines += [f"  {name:20s} {process.description}" for name, process in self.processes.items()]
+        return "\n".join(lines)
 
     # -- the model, as filters use it: compiled, batched, with the nominal physical parameters
 

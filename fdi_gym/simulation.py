@@ -47,9 +47,7 @@ def no_noise(plant: Plant, steps: int) -> tuple[Array, Array]:
     return np.zeros((steps, len(plant.states))), np.zeros((steps + 1, len(plant.outputs)))
 
 
-def simulate(
-    plant: Plant, scenarios: Sequence[FaultScenario], noise: Sequence[tuple[Array, Array]] | None = None
-) -> Record:
+def simulate(plant: Plant, scenarios: Sequence[FaultScenario], noise: Sequence[tuple[Array, Array]] | None = None) -> Record:
     """Fly the scenarios.
 
     Args:

@@ -12,15 +12,24 @@ Equation numbers: A. Guven, C. Hajiyev, WSEAS Transactions on Signal Processing 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
-from fdi_gym.estimation.decision import Logic, distance_logic
+from fdi_gym.diagnosis import Diagnoser, diagnoser
+from fdi_gym.estimation.decision import (
+    Logic,
+    distance_logic,
+    penalty_logic,
+    persistence_logic,
+    surface_candidate,
+    with_logic,
+)
 from fdi_gym.estimation.kalman import T, right_divide, symmetric, times
 from fdi_gym.estimation.linear import LinearModel, linear_model
 from fdi_gym.plant import Array, Plant
+
+FORGETTING = ("none", "directional", "exponential")
 
 
 class TwoStage(NamedTuple):
@@ -91,42 +100,34 @@ def step(s: TwoStage, u: Array, y: Array, model: LinearModel, Q: Array, R: Array
     return TwoStage(x, Px, z, Pz, V - Kx @ H, nu, Sz)
 
 
-def with_logic(plant: Plant, first: Any, advance: Any, logic: Logic, structured: bool = False) -> Diagnoser:
-    """A diagnoser from a filter and a decision logic.
+def make_logic(plant: Plant, decision: str, threshold: float, release_after: int) -> Logic:
+    """The decision logic by name; for plants with simultaneous-fault labels always the penalty logic.
 
-    Args:
-        plant: The plant.
-        first: first(n) gives the filter's state.
-        advance: advance(state, u, y) gives the next one, with the fields z and Pz.
-        logic: The decision logic.
-        structured: Report the magnitude along the label's own line in place of the free estimate.
+    Raises:
+        ValueError: Unknown name.
     """
-    nominal = plant.nominal_theta
+    if decision == "thresholds":
+        return persistence_logic(plant, surface_candidate(plant, position={"aileron": 1.5, "rudder": 0.5}))
+    if decision != "distance":
+        raise ValueError(f"unknown decision {decision!r}; there are distance, thresholds")
+    if any(len(label.modes) > 1 for label in plant.labels):
+        return penalty_logic(plant, penalty=threshold)
+    return distance_logic(plant, threshold=threshold, release_after=release_after)
 
-    def init(n: int) -> Any:
-        return 0, first(n), logic.start(n)
 
-    def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
-        k, s, decided = state
-        y, u, _ = plant.split(obs)
-        n = len(obs)
-        if k > 0:
-            s = advance(s, u, y)
-            decided, said = logic.step(decided, k, s.z, s.Pz)
-        else:  # no interval has ended: the filter starts from its prior
-            said = None
-        alarm, label = (np.zeros(n, bool), np.zeros(n, np.int64)) if said is None else said[:2]
-        z = s.z if said is None or not structured else said.structured
-        std = np.sqrt(np.einsum("npp->np", s.Pz))
-        return (k + 1, s, decided), Diagnosis(alarm, label, nominal + z, std)
-
-    return Diagnoser(init, update)
+def prior(plant: Plant) -> tuple[Array, Array]:
+    """Initial covariances of state and fault parameter: 0.01 I, and 1 for an effectiveness, 4 for a position."""
+    return 0.01 * np.eye(len(plant.states)), np.diag([4.0 if s.unit else 1.0 for s in plant.theta])
 
 
 @diagnoser("two_stage_kf", "Two-stage Kalman filter, constant bias")
 @diagnoser("two_stage_kf_random_walk", "Two-stage Kalman filter, random-walk bias", q_bias=1e-4)
 @diagnoser("two_stage_kf_directional", "Two-stage Kalman filter, directional forgetting", forgetting="directional")
 @diagnoser("two_stage_kf_exponential", "Two-stage Kalman filter, exponential forgetting", forgetting="exponential")
+@diagnoser("two_stage_kf_exponential_fast", "The same, forgetting 0.96 and quick decisions: for intermittent faults",
+           forgetting="exponential", factor=0.96, threshold=3.0, release_after=10)  # fmt: skip
+@diagnoser("two_stage_kf_thresholds", "Two-stage Kalman filter, directional forgetting, fixed thresholds",
+           forgetting="directional", decision="thresholds")  # fmt: skip
 def two_stage_kf(
     plant: Plant,
     *,
@@ -135,28 +136,31 @@ def two_stage_kf(
     factor: float = 0.99,
     a_min: float = 1e-4,
     a_max: float = 1.0,
+    decision: str = "distance",
     threshold: float = 8.0,
     release_after: int = 50,
     structured: bool = False,
 ) -> Diagnoser:
-    """The two-stage Kalman filter with the distance logic.
+    """The two-stage Kalman filter with a decision logic.
 
     Args:
         plant: A linear plant.
         q_bias: Variance that each entry of the fault parameter gains per step (random walk).
         forgetting: "none", "directional" or "exponential".
         factor: Forgetting factor of the exponential rule.
-        a_min, a_max: Floor increment and cap of the forgetting rules.
-        threshold: Of the distance logic.
-        release_after: Of the distance logic.
+        a_min: Floor increment of the directional rule.
+        a_max: Cap of both rules.
+        decision: "distance" or "thresholds" (fixed thresholds per surface).
+        threshold: Of the distance logic; with simultaneous-fault labels the penalty per fault.
+        release_after: Of the distance logic, samples.
         structured: Report the magnitude of the declared fault in place of the free estimate.
 
     Raises:
         NotApplicableError: The plant is nonlinear.
-        ValueError: Unknown forgetting rule.
+        ValueError: Unknown forgetting rule or decision.
     """
-    if forgetting not in ("none", "directional", "exponential"):
-        raise ValueError(f"unknown forgetting {forgetting!r}; there are none, directional, exponential")
+    if forgetting not in FORGETTING:
+        raise ValueError(f"unknown forgetting {forgetting!r}; there are {', '.join(FORGETTING)}")
     model = linear_model(plant)
     Qz = q_bias * np.eye(len(plant.theta))
     P_x, P_z = prior(plant)
@@ -164,12 +168,5 @@ def two_stage_kf(
     def advance(s: TwoStage, u: Array, y: Array) -> TwoStage:
         return step(s, u, y, model, plant.Q, plant.R, forget(s.Pz, forgetting, factor, a_min, a_max) + Qz)
 
-    return with_logic(
-        plant, lambda n: start(n, len(plant.outputs), P_x, P_z), advance,
-        distance_logic(plant, threshold=threshold, release_after=release_after), structured,
-    )  # fmt: skip
-
-
-def prior(plant: Plant) -> tuple[Array, Array]:
-    """Initial covariances of state and fault parameter: 0.01 I, and 1 for an effectiveness, 4 for a position."""
-    return 0.01 * np.eye(len(plant.states)), np.diag([4.0 if s.unit else 1.0 for s in plant.theta])
+    logic = make_logic(plant, decision, threshold, release_after)
+    return with_logic(plant, lambda n: start(n, len(plant.outputs), P_x, P_z), advance, logic, structured)

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi_gym.plant import Array, Plant
+from fdi_gym.diagnosis import Diagnoser, Diagnosis
+from fdi_gym.plant import Array, FaultMode, Plant
 
 
 class Decision(NamedTuple):
@@ -32,64 +33,98 @@ class Logic(NamedTuple):
 
 
 class Manifolds(NamedTuple):
-    """The set that each label spans in the estimated space: offset + directions @ m, m between low and high."""
+    """The sets that labels of f simultaneous faults span in the estimated space: offset + directions m, low <= m <= high."""
 
-    labels: list[int]
-    offset: list[Array]  # (p,)
-    direction: list[Array]  # (p, faults)
-    low: list[Array]  # (faults,)
-    high: list[Array]
+    labels: Array  # (h,) label indices
+    offset: Array  # (h, p)
+    direction: Array  # (h, p, f)
+    low: Array  # (h, f)
+    high: Array  # (h, f)
 
 
-def manifolds(plant: Plant) -> Manifolds:
-    """The faulty labels of a plant as sets, from the lines of their modes."""
-    found = Manifolds([], [], [], [], [])
+def manifolds(plant: Plant) -> list[Manifolds]:
+    """The faulty labels of a plant as sets, from the lines of their modes, grouped by the number of faults."""
     modes = {mode.name: mode for mode in plant.modes}
+    groups: dict[int, list[tuple[int, list[FaultMode]]]] = {}
     for index, label in enumerate(plant.labels):
-        lines = [modes[name] for name in sorted(label.modes)]
-        if lines:
-            found.labels.append(index)
-            found.offset.append(np.sum([line.offset for line in lines], axis=0))
-            found.direction.append(np.array([line.direction for line in lines]).T)
-            found.low.append(np.array([line.reach[0] for line in lines]))
-            found.high.append(np.array([line.reach[1] for line in lines]))
-    return found
+        if label.modes:
+            groups.setdefault(len(label.modes), []).append((index, [modes[name] for name in sorted(label.modes)]))
+    return [
+        Manifolds(
+            np.array([index for index, _ in group]),
+            np.array([np.sum([line.offset for line in lines], axis=0) for _, lines in group]),
+            np.array([np.transpose([line.direction for line in lines]) for _, lines in group]),
+            np.array([[line.reach[0] for line in lines] for _, lines in group]),
+            np.array([[line.reach[1] for line in lines] for _, lines in group]),
+        )
+        for _, group in sorted(groups.items())
+    ]
 
 
-def closest(z: Array, I: Array, offset: Array, D: Array, low: Array, high: Array) -> tuple[Array, Array]:  # noqa: E741
-    """Least squares in a box: min over low <= m <= high of (z - offset - D m)' I (z - offset - D m).
+def closest(z: Array, I: Array, sets: Manifolds) -> tuple[Array, Array]:  # noqa: E741
+    """Distance of each estimate to each set: min over m in its box of (z - offset - D m)' I (z - offset - D m).
 
-    z (n, p), I (n, p, p), D (p, f). Returns (cost (n,), m (n, f)). Exact: the minimum of a convex quadratic over a
-    box lies where some coordinates are free and the others at a bound, and all such choices are tried.
+    z (n, p), I = P^-1 (n, p, p). Returns (J (n, h), m (n, h, f)). Exact: the minimum of a convex quadratic over a box
+    lies where some coordinates are free and the others at a bound, and all such choices are tried.
     """
-    q = z - offset
-    ID = I @ D  # (n, p, f)
-    G = np.swapaxes(ID, 1, 2) @ D  # (n, f, f)
-    g = np.einsum("npf,np->nf", ID, q)
-    base = np.einsum("np,npr,nr->n", q, I, q)
-    f = D.shape[1]
-    cost, best = np.full(len(z), np.inf), np.zeros((len(z), f))
+    q = z[:, None, :] - sets.offset
+    Iq = q @ I  # (n, h, p)
+    base = (Iq * q).sum(axis=2)
+    g = (Iq[:, :, None, :] @ sets.direction)[:, :, 0, :]  # (n, h, f)
+    G = np.swapaxes(sets.direction, 1, 2) @ I[:, None] @ sets.direction  # (n, h, f, f)
+    f = g.shape[2]
+    if f == 1:
+        m = np.clip(g / G[..., 0], sets.low, sets.high)
+        return base - (2 * m * g - m * m * G[..., 0])[..., 0], m
+    J, best = np.full(base.shape, np.inf), np.zeros_like(g)
     for choice in itertools.product((None, 0, 1), repeat=f):
-        m = np.array([0.0 if c is None else (low, high)[c][i] for i, c in enumerate(choice)])
-        m = np.tile(m, (len(z), 1))
-        free = [i for i, c in enumerate(choice) if c is None]
-        fixed = [i for i, c in enumerate(choice) if c is not None]
+        free = [i for i, bound in enumerate(choice) if bound is None]
+        fixed = [i for i, bound in enumerate(choice) if bound is not None]
+        m = np.zeros_like(g)
+        for i in fixed:
+            m[..., i] = (sets.low, sets.high)[choice[i]][:, i]  # type: ignore[index]
         if free:
-            right = g[:, free] - np.einsum("nij,nj->ni", G[:, free][:, :, fixed], m[:, fixed])
-            m[:, free] = np.linalg.solve(G[:, free][:, :, free], right[..., None])[..., 0]
-            # what rounding puts a hair outside is inside; the rest is another choice's business
-            inside = ((m >= low - 1e-12) & (m <= high + 1e-12)).all(axis=1)
-        else:
-            inside = np.ones(len(z), bool)
-        value = base - 2 * np.einsum("nf,nf->n", g, m) + np.einsum("ni,nij,nj->n", m, G, m)
-        better = inside & (value < cost)
-        cost, best = np.where(better, value, cost), np.where(better[:, None], m, best)
-    return cost, best
+            right = g[..., free] - (G[..., free, :][..., fixed] @ m[..., fixed, None])[..., 0]
+            m[..., free] = np.linalg.solve(G[..., free, :][..., free], right[..., None])[..., 0]
+        # what rounding puts a hair outside is inside; the rest is another choice's business
+        inside = ((m >= sets.low - 1e-12) & (m <= sets.high + 1e-12)).all(axis=2)
+        value = base - 2 * (g * m).sum(axis=2) + (m[..., None, :] @ G @ m[..., None])[..., 0, 0]
+        better = inside & (value < J)
+        J, best = np.where(better, value, J), np.where(better[..., None], m, best)
+    return J, best
+
+
+class Fits(NamedTuple):
+    """The faulty labels ranked by distance, over all groups."""
+
+    labels: Array  # (h,)
+    J: Array  # (n, h)
+    J_healthy: Array  # (n,)
+    deviation: Array  # (n, h, p) the closest point of each label's set
+
+
+def fit(z: Array, P: Array, groups: list[Manifolds]) -> Fits:
+    """Distances of the estimate to healthy and to every faulty label, in the metric of its covariance."""
+    I = np.linalg.inv(P)  # noqa: E741 (the metric itself is needed: it weighs many residuals)
+    parts = [closest(z, I, sets) for sets in groups]
+    points = [sets.offset + (sets.direction @ m[..., None])[..., 0] for sets, (_, m) in zip(groups, parts, strict=True)]
+    return Fits(
+        np.concatenate([sets.labels for sets in groups]),
+        np.concatenate([J for J, _ in parts], axis=1),
+        (z[:, None, :] @ I @ z[:, :, None])[:, 0, 0],
+        np.concatenate(points, axis=1),
+    )
 
 
 def _count(condition: Array, counter: Array) -> Array:
     """Consecutive samples on which the condition has held."""
     return np.where(condition, counter + 1, 0)
+
+
+def _structured(fits: Fits, label: Array) -> Array:
+    """The closest point of the declared label's set; healthy where none is declared."""
+    mine = fits.labels == label[:, None]
+    return (fits.deviation * mine[..., None]).sum(axis=1)
 
 
 def distance_logic(
@@ -101,16 +136,14 @@ def distance_logic(
     release_after: int = 50,
     warmup: int = 150,
 ) -> Logic:
-    """Mahalanobis distance of the estimate to the faulty labels' manifolds against its distance to healthy.
+    """Mahalanobis distance of the estimate to the faulty labels' sets against its distance to healthy.
 
     G = J_0 - min J_h is the gain in fit of the best faulty label. Alarm at the `alarm_after`-th consecutive sample with
     G > threshold; in alarm, the label follows the best one after it differed for `switch_after` samples, and is
     released after `release_after` samples with G < threshold / 2 (a release wins over a switch). Silent and not
     counting for the first `warmup` samples.
     """
-    sets = manifolds(plant)
-    labels = np.array(sets.labels)
-    p = len(plant.estimated)
+    groups, p = manifolds(plant), len(plant.estimated)
 
     def start(n: int) -> tuple[Array, ...]:
         return tuple(np.zeros(n, np.int64) for _ in range(4))
@@ -120,28 +153,134 @@ def distance_logic(
         n = len(z)
         if k <= warmup:
             return state, Decision(np.zeros(n, bool), label, np.zeros((n, p)))
-        I = np.linalg.inv(P)  # noqa: E741 (the metric itself is needed: it weighs many residuals)
-        fits = [closest(z, I, *line) for line in zip(*sets[1:], strict=True)]
-        J = np.stack([cost for cost, _ in fits], axis=1)
-        best = np.argmin(J, axis=1)
-        gain = np.einsum("np,npr,nr->n", z, I, z) - J[np.arange(n), best]
-        best = labels[best]
+        fits = fit(z, P, groups)
+        nearest = np.argmin(fits.J, axis=1)
+        gain, best = fits.J_healthy - fits.J[np.arange(n), nearest], fits.labels[nearest]
         on = label > 0
         over = _count((gain > threshold) & ~on, over)
         other = _count((best != label) & on, other)
         under = _count((gain < threshold / 2) & on, under)
-        raised, released = over == alarm_after, under == release_after
-        switched = other == switch_after
+        raised, switched, released = over == alarm_after, other == switch_after, under == release_after
         label = np.where(released, 0, np.where(raised | switched, best, label))
-        over, other, under = (
-            np.where(raised, 0, over),
-            np.where(switched | released, 0, other),
-            np.where(released, 0, under),
-        )
-        structured = np.zeros((n, p))
-        for i, (_, m) in enumerate(fits):
-            mine = label == labels[i]
-            structured[mine] = sets.offset[i] + m[mine] @ sets.direction[i].T
-        return (label, over, other, under), Decision(label > 0, label, structured)
+        over, under = np.where(raised, 0, over), np.where(released, 0, under)
+        other = np.where(switched | released, 0, other)
+        return (label, over, other, under), Decision(label > 0, label, _structured(fits, label))
 
     return Logic(start, step)
+
+
+def penalty_logic(plant: Plant, *, penalty: float = 8.0, change_after: int = 10, warmup: int = 150) -> Logic:
+    """Distance to each label's set plus a penalty per fault; for labels of several simultaneous faults.
+
+    The label changes when the same other one has been the best for `change_after` consecutive samples. Silent for the
+    first `warmup` samples.
+    """
+    groups, p = manifolds(plant), len(plant.estimated)
+    faults = np.array([len(label.modes) for label in plant.labels])
+
+    def start(n: int) -> tuple[Array, ...]:
+        return tuple(np.zeros(n, np.int64) for _ in range(3))
+
+    def step(state: tuple[Array, ...], k: int, z: Array, P: Array) -> tuple[tuple[Array, ...], Decision]:
+        label, candidate, count = state
+        n = len(z)
+        if k <= warmup:
+            return state, Decision(np.zeros(n, bool), label, np.zeros((n, p)))
+        fits = fit(z, P, groups)
+        cost = np.column_stack([fits.J_healthy, fits.J + penalty * faults[fits.labels]])
+        best = np.append(0, fits.labels)[np.argmin(cost, axis=1)]
+        count = np.where(best == label, 0, np.where(best == candidate, count + 1, 1))
+        label = np.where(count == change_after, best, label)
+        return (label, best, np.where(count == change_after, 0, count)), Decision(label > 0, label, _structured(fits, label))
+
+    return Logic(start, step)
+
+
+def persistence_logic(plant: Plant, candidate: Callable[[Array], Array], *, after: int = 20, warmup: int = 150) -> Logic:
+    """The label becomes the candidate at the `after`-th consecutive sample on which that is the same.
+
+    Args:
+        plant: The plant.
+        candidate: Maps the estimate's deviation from healthy (n, p) to a label (n,), sample by sample.
+        after: Persistence in samples.
+        warmup: Samples without a decision and without counting; the candidate before them is 0.
+    """
+    p = len(plant.estimated)
+
+    def start(n: int) -> tuple[Array, ...]:
+        return tuple(np.zeros(n, np.int64) for _ in range(3))
+
+    def step(state: tuple[Array, ...], k: int, z: Array, P: Array) -> tuple[tuple[Array, ...], Decision]:
+        label, last, count = state
+        n = len(z)
+        if k <= warmup:
+            return state, Decision(np.zeros(n, bool), label, np.zeros((n, p)))
+        now = candidate(z)
+        count = np.where(now == last, count + 1, 1)
+        label = np.where(count == after, now, label)
+        return (label, now, count), Decision(label > 0, label, np.where((label > 0)[:, None], z, 0.0))
+
+    return Logic(start, step)
+
+
+def surface_candidate(plant: Plant, *, loss: float = 0.4, total: float = 0.8, position: dict[str, float]) -> Callable:
+    """Fixed thresholds on the effectiveness and position of each control surface.
+
+    The surface with the largest max(-gamma / loss, |b| / position) is faulty where that exceeds 1: stuck if
+    -gamma > total or |b| exceeds its position limit, else LOE. For plants whose estimate has the entries gamma_<surface>
+    and b_<surface> and whose modes are "<surface> LOE" and "<surface> stuck".
+    """
+    names = [s.name for s in plant.estimated]
+    gamma = [names.index(f"gamma_{surface}") for surface in position]
+    b = [names.index(f"b_{surface}") for surface in position]
+    limit = np.array(list(position.values()))
+    lost = np.array([plant.label_of(frozenset({f"{surface} LOE"})) for surface in position])
+    stuck = np.array([plant.label_of(frozenset({f"{surface} stuck"})) for surface in position])
+
+    def candidate(z: Array) -> Array:
+        loss_of, place = -z[:, gamma], np.abs(z[:, b])
+        severity = np.maximum(loss_of / loss, place / limit)
+        s = np.argmax(severity, axis=1)
+        i = np.arange(len(z))
+        is_stuck = (loss_of[i, s] > total) | (place[i, s] > limit[s])
+        return np.where(severity[i, s] <= 1, 0, np.where(is_stuck, stuck[s], lost[s]))
+
+    return candidate
+
+
+def with_logic(
+    plant: Plant,
+    first: Callable[[int], Any],
+    advance: Callable[[Any, Array, Array], Any],
+    logic: Logic,
+    structured: bool = False,
+) -> Diagnoser:
+    """A diagnoser from a parameter-estimating filter and a decision logic.
+
+    Args:
+        plant: The plant.
+        first: first(n) gives the filter's state, with the fields z (n, p), the estimate's deviation from healthy, and
+            Pz (n, p, p), its covariance.
+        advance: advance(state, u, y) gives the next one from the command u_{k-1} and the measurement y_k.
+        logic: The decision logic.
+        structured: Report the magnitude along the declared label's own line in place of the free estimate.
+    """
+    healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
+
+    def init(n: int) -> Any:
+        return 0, first(n), logic.start(n)
+
+    def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
+        k, s, decided = state
+        n = len(obs)
+        if k == 0:  # no interval has ended: the filter keeps its prior
+            said = Decision(np.zeros(n, bool), np.zeros(n, np.int64), np.zeros_like(s.z))
+        else:
+            y, u, _ = plant.split(obs)
+            s = advance(s, u, y)
+            decided, said = logic.step(decided, k, s.z, s.Pz)
+        std = np.sqrt(np.einsum("npp->np", s.Pz))
+        theta = healthy + (said.structured if structured else s.z)
+        return (k + 1, s, decided), Diagnosis(said.alarm, said.label, theta, std)
+
+    return Diagnoser(init, update)

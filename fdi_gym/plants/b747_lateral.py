@@ -200,9 +200,7 @@ def loss(surface: str, gamma: float, onset: int, end: int | None = None) -> Faul
 def stuck(surface: str, b: float | None, onset: int, end: int | None = None, kind: str = "position") -> Fault:
     """A stuck surface: u_eff = b [deg]; b = None freezes it where it is commanded at the onset (jam)."""
     place = Hold(f"b_{surface}", surface) if b is None else Abrupt(f"b_{surface}", b)
-    return Fault(
-        f"{surface} stuck", "jam" if b is None else kind, onset, [Abrupt(f"gamma_{surface}", -1.0), place], end
-    )
+    return Fault(f"{surface} stuck", "jam" if b is None else kind, onset, [Abrupt(f"gamma_{surface}", -1.0), place], end)
 
 
 def paper(command: str = "multisine", signs_seed: int = 0) -> FaultScenario:
@@ -249,8 +247,8 @@ def processes(airframe: str, closed: bool, dual: bool) -> dict[str, FaultProcess
         faults = []
         if rng.random() >= 0.2:
             i, second = int(rng.integers(2)), rng.random() < 0.5
-            for j in [i, 1 - i] if second else [i]:
-                faults.append(fault(rng, j, int(rng.integers(200, 801)), None, (-0.9, -0.3)))
+            surfaces = [i, 1 - i] if second else [i]
+            faults = [fault(rng, j, int(rng.integers(200, 801)), None, (-0.9, -0.3)) for j in surfaces]
         return flight(rng, faults)
 
     def hard(rng: np.random.Generator) -> FaultScenario:

@@ -1,0 +1,50 @@
+"""What the reproductions share: resumable pieces, comparison of figures, Markdown."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import joblib
+import msgspec
+from tqdm import tqdm
+
+from fdi_gym.evaluation import write_whole
+
+
+def pieces(folder: Path, jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]], workers: int = -1) -> dict[str, Any]:
+    """Run named jobs in parallel; each result is one JSON file, and what is there already is not run again."""
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def one(name: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+        write_whole(folder / f"{name}.json", msgspec.json.encode(function(*arguments)))
+
+    missing = {name: job for name, job in jobs.items() if not (folder / f"{name}.json").exists()}
+    if missing:
+        parallel = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")
+        tasks = (joblib.delayed(one)(name, *job) for name, job in missing.items())
+        for _ in tqdm(parallel(tasks), total=len(missing), unit="piece"):
+            pass
+    return {name: msgspec.json.decode((folder / f"{name}.json").read_bytes()) for name in jobs}
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [list(head), *[list(row) for row in rows]]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
+    text = ["| " + " | ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) + " |" for line in lines]
+    text.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
+    return "\n".join(text)
+
+
+def compared(reference: float, found: float, error: float, digits: int = 3, tally: list[bool] | None = None) -> str:
+    """ "reference / found", starred where they differ by more than three standard errors of the difference.
+
+    Half a unit of the reference's last digit is allowed for its rounding.
+    """
+    same = (math.isnan(reference) and math.isnan(found)) or abs(reference - found) <= 3 * error + 0.5 * 10**-digits
+    if tally is not None:
+        tally.append(same)
+    return f"{reference:.{digits}f} / {found:.{digits}f}{'' if same else ' *'}"

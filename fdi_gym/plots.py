@@ -1,0 +1,141 @@
+"""Pictures: signals, truth and diagnosis of a flight."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from fdi_gym.plant import Array, Plant
+from fdi_gym.simulation import Record
+
+INK, TRUTH, SAID, SHADE = "#333333", "#1b6ca8", "#d1495b", "#f3dcd4"
+
+
+class Canvas:
+    """One figure, drawn again as the flight goes on: what the sensors say, the true label and the declared one, and in
+    the identification task the estimated entries beside the truth.
+
+    Args:
+        plant: The plant.
+        task: "isolation" or "identification".
+        window: Show a window that follows along; else pictures only.
+    """
+
+    def __init__(self, plant: Plant, task: str, window: bool = False):
+        from matplotlib.figure import Figure
+
+        self.plant, self.task = plant, task
+        rows = 2 if task == "isolation" else 1 + min(len(plant.estimated), 4)
+        size = (9.6, 6.4)
+        if window:
+            import matplotlib.pyplot as plt
+
+            self.figure: Any = plt.figure(figsize=size, num=plant.env_id)
+            self._show = plt
+        else:
+            from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+            self.figure = Figure(figsize=size, dpi=100)
+            FigureCanvasAgg(self.figure)
+            self._show = None
+        ratios = [2.2, *[1.0] * (rows - 1)]
+        self.axes = self.figure.subplots(rows, 1, sharex=True, gridspec_kw={"height_ratios": ratios})
+
+    def draw(self, record: Record, k: int, declared: Sequence[tuple[int, Any]]) -> Array | None:
+        """Draw the flight up to sample k.
+
+        Args:
+            record: One flight (its first one is drawn).
+            k: The current sample.
+            declared: (sample, action) pairs so far; actions are labels or estimates in physical units.
+
+        Returns:
+            The picture, (H, W, 3) uint8, or None for a window.
+        """
+        plant, t = self.plant, np.arange(k + 1) * self.plant.dt
+        label = record.label[0, : k + 1]
+        said_t = np.array([j for j, _ in declared]) * plant.dt
+        for axis in self.axes:
+            axis.clear()
+            axis.spines[["top", "right"]].set_visible(False)
+            for first, stop in _spans(label > 0):
+                axis.axvspan(first * plant.dt, stop * plant.dt, color=SHADE, lw=0)
+        top = self.axes[0]
+        for j, signal in enumerate(plant.outputs):
+            values = (record.obs[0, : k + 1, j] - signal.nominal) / signal.scale
+            top.plot(t, values, lw=0.8, label=signal.name)
+        top.legend(loc="upper left", ncol=6, fontsize=7, frameon=False)
+        top.set_ylabel("sensors, scaled")
+        top.set_title(f"{plant.env_id}   t = {k * plant.dt:.1f} s   shaded: a fault acts", loc="left", fontsize=9)
+        if self.task == "isolation":
+            axis = self.axes[1]
+            axis.step(t, label, where="post", color=TRUTH, lw=1.8, label="truth")
+            axis.plot(said_t, [int(a) for _, a in declared], ".", ms=2.5, color=SAID, label="diagnosis")
+            axis.set_ylim(-0.5, len(plant.labels) - 0.5)
+            axis.set_yticks(range(len(plant.labels)), [entry.name for entry in plant.labels], fontsize=7)
+            axis.legend(loc="upper left", fontsize=7, frameon=False)
+        else:
+            for j, axis in enumerate(self.axes[1:]):
+                axis.plot(t, record.target[0, : k + 1, j], color=TRUTH, lw=1.8, label="truth")
+                axis.plot(said_t, [a[j] for _, a in declared], color=SAID, lw=0.9, label="diagnosis")
+                axis.set_ylabel(f"{plant.estimated[j].name}\n{plant.estimated[j].unit}", fontsize=7)
+            self.axes[1].legend(loc="upper left", fontsize=7, frameon=False, ncol=2)
+        self.axes[-1].set_xlabel("time, s")
+        self.axes[-1].set_xlim(0, max(k, 1) * plant.dt)
+        if self._show is not None:
+            self.figure.canvas.draw_idle()
+            self._show.pause(1e-3)
+            return None
+        self.figure.tight_layout()
+        self.figure.canvas.draw()
+        return np.asarray(self.figure.canvas.buffer_rgba())[..., :3].copy()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._show is not None:
+            self._show.close(self.figure)
+
+
+def _spans(mask: Array) -> list[tuple[int, int]]:
+    """(first, stop) of the runs of True. Sample k closes the interval from k - 1."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
+    return [(max(int(a) - 1, 0), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def flight(plant: Plant, record: Record, said: dict[str, Any], i: int = 0) -> Any:
+    """A figure of one recorded flight with the diagnoses of several methods: labels, then the estimated entries.
+
+    Args:
+        plant: The plant.
+        record: The flights.
+        said: Decisions by name of the method.
+        i: Which flight.
+    """
+    from matplotlib.figure import Figure
+
+    estimates = {name: d for name, d in said.items() if d.theta is not None}
+    rows = 1 + min(len(plant.estimated), 4)
+    figure = Figure(figsize=(9.6, 1.6 + 1.5 * rows), dpi=120, layout="constrained")
+    axes = figure.subplots(rows, 1, sharex=True)
+    length = int(record.length[i]) + 1
+    t = np.arange(length) * plant.dt
+    colours = [SAID, "#e0a030", "#4c9f70", "#7b5ea7", INK]
+    axes[0].step(t, record.label[i, :length], where="post", color=TRUTH, lw=3.5, alpha=0.5, label="truth")
+    for colour, (name, decisions) in zip(colours, said.items(), strict=False):
+        axes[0].step(t, decisions.mode[i, :length], where="post", color=colour, lw=1.1, label=name)
+    axes[0].set_yticks(range(len(plant.labels)), [entry.name for entry in plant.labels], fontsize=7)
+    for j, axis in enumerate(axes[1:]):
+        axis.plot(t, record.target[i, :length, j], color=TRUTH, lw=3.5, alpha=0.5)
+        for colour, (name, decisions) in zip(colours, said.items(), strict=False):
+            if name in estimates:
+                axis.plot(t, decisions.theta[i, :length, j], color=colour, lw=0.9)
+        axis.set_ylabel(f"{plant.estimated[j].name} {plant.estimated[j].unit}", fontsize=8)
+    for axis in axes:
+        axis.spines[["top", "right"]].set_visible(False)
+        for first, stop in _spans(record.label[i, :length] > 0):
+            axis.axvspan(first * plant.dt, stop * plant.dt, color=SHADE, lw=0, zorder=0)
+    axes[0].legend(loc="upper left", fontsize=7, frameon=False, ncol=5, bbox_to_anchor=(0, 1.25))
+    axes[-1].set_xlabel("time, s")
+    return figure
