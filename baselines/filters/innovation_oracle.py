@@ -179,13 +179,13 @@ class Oracle(NamedTuple):
     said: Diagnosis
 
 
-@diagnoser("known_onset_oracle", "Knows the onset: innovation evidence under the standard process's priors",
+@diagnoser("innovation_oracle", "Knows the onset: innovation evidence under the standard process's priors",
            clairvoyant=True)  # fmt: skip
-@diagnoser("known_window_oracle", "Knows the fault windows: innovation evidence under the hard process's priors",
+@diagnoser("innovation_oracle_windows", "Knows the fault windows: innovation evidence under the hard process's priors",
            clairvoyant=True, hard=True, every=20)  # fmt: skip
-@diagnoser("known_window_oracle_forced", "The same, never answering none inside a window",
+@diagnoser("innovation_oracle_windows_forced", "The same, never answering none inside a window",
            clairvoyant=True, hard=True, every=20, none_allowed=False)  # fmt: skip
-def known_onset_oracle(
+def innovation_oracle(
     plant: Plant, *, scenarios: Sequence[FaultScenario], hard: bool = False, every: int = 1, none_allowed: bool = True
 ) -> Diagnoser:
     """The oracle.
@@ -202,7 +202,7 @@ def known_onset_oracle(
         NotApplicableError: Another plant.
         ValueError (from init): The number of episodes is not that of the scenarios.
     """
-    model.require_missile(plant, "the known-onset oracle")
+    model.require_missile(plant, "the innovation oracle")
     scale = float(plant.options["fault_scale"])
     if hard:
         sizes, p_rates, rho, fin = [(0.08, 0.30), (0.08, 0.30), (0.05, 0.20), (0.15, 0.45)], (0.5, 3.0), 0.08, 0.05
@@ -258,9 +258,7 @@ def known_onset_oracle(
             said = answer(evidence(free, window, jammed, beta, p))
         said = silent(said, active)
         held = np.where(opens, now.delta, o.held)
-        return Oracle(
-            k + 1, np.ones(len(obs), bool), o.windows, now, first, second, held, free, window, jammed, said
-        ), said
+        return Oracle(k + 1, np.ones(len(obs), bool), o.windows, now, first, second, held, free, window, jammed, said), said
 
     def answer(found: Evidence) -> Diagnosis:
         log = found.log.copy()
