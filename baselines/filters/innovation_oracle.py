@@ -179,12 +179,7 @@ class Oracle(NamedTuple):
     said: Diagnosis
 
 
-@diagnoser("innovation_oracle", "Knows the onset: innovation evidence under the standard process's priors",
-           clairvoyant=True)  # fmt: skip
-@diagnoser("innovation_oracle_windows", "Knows the fault windows: innovation evidence under the hard process's priors",
-           clairvoyant=True, hard=True, every=20)  # fmt: skip
-@diagnoser("innovation_oracle_windows_forced", "The same, never answering none inside a window",
-           clairvoyant=True, hard=True, every=20, none_allowed=False)  # fmt: skip
+@diagnoser("innovation_oracle", "Knows the onset: evidence of the innovations under the process's priors", clairvoyant=True)
 def innovation_oracle(
     plant: Plant, *, scenarios: Sequence[FaultScenario], hard: bool = False, every: int = 1, none_allowed: bool = True
 ) -> Diagnoser:
