@@ -1,0 +1,68 @@
+"""Every plant, environment and diagnoser that exists keeps the contract."""
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from conftest import PLANTS, build
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+from fdi_gym.diagnosis import NotApplicableError, diagnosers
+from fdi_gym.envs import FDIEnv
+from fdi_gym.faults import draw
+from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env
+
+TASKS = [{}, {"task": "identification"}, {"decision_period": 7}, {"task": "identification", "units": "scaled"}]
+
+
+def test_plant(plant):
+    check_plant(plant, seeds=range(3))
+    check_streams(plant)
+
+
+@pytest.mark.parametrize("arguments", TASKS, ids=lambda a: "-".join(map(str, a.values())) or "isolation")
+def test_vector_env_equals_single_ones(plant, arguments):
+    check_vector_env(plant, n=3, steps=200, **arguments)
+
+
+def test_vector_env_under_mismatch(plant):
+    if plant.perturb is None:
+        pytest.skip("declares no mismatch")
+    check_vector_env(plant, n=2, steps=200, mismatch=0.01)
+
+
+@pytest.mark.parametrize(
+    "arguments", [{}, {"task": "identification", "units": "scaled"}], ids=["isolation", "identification"]
+)
+def test_env_checkers_are_silent(plant, arguments):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(FDIEnv(plant.id, **arguments), skip_render_check=True)
+        check_env_sb3(FDIEnv(plant.id, **arguments))
+
+
+@pytest.mark.parametrize("plant_id", PLANTS)
+def test_made_by_id_in_both_forms(plant_id):
+    env = gym.make(build(plant_id).env_id)
+    many = gym.make_vec(f"fdi_gym:{build(plant_id).env_id}", num_envs=2)
+    first, _ = env.reset(seed=5)
+    both, _ = many.reset(seed=5)
+    assert np.array_equal(first, both[0])
+
+
+@pytest.mark.parametrize("plant_id", PLANTS)
+@pytest.mark.parametrize("name", list(diagnosers()))
+def test_diagnoser(plant_id, name):
+    entry = diagnosers()[name]
+
+    def make(plant, scenarios):
+        known = {"scenarios": scenarios} if entry.clairvoyant else {}
+        return entry.build(plant, **entry.settings, **known)
+
+    try:
+        make(build(plant_id), [draw(build(plant_id).processes["standard"], 0)])
+    except NotApplicableError as reason:
+        pytest.skip(str(reason))
+    check_diagnoser(make, build(plant_id), samples=240)
