@@ -414,6 +414,13 @@ def test_not_applicable_elsewhere(name):
         make_diagnoser(name, load_plant("B747Lateral"), **known)
 
 
+@pytest.mark.parametrize("name", ["augmented_ekf_bank", "augmented_ekf_imm", "innovation_oracle"])
+def test_filters_that_divide_by_the_noise_decline_a_plant_without(quiet, name):
+    known = {"scenarios": []} if name == "innovation_oracle" else {}
+    with pytest.raises(NotApplicableError, match="noise"):
+        make_diagnoser(name, quiet, **known)
+
+
 def test_plant_conformance(plant):
     check_plant(plant, range(3))
     check_streams(plant)

@@ -70,9 +70,9 @@ def augmented_ekf_bank(
         release_after: Consecutive samples below it.
 
     Raises:
-        NotApplicableError: Another plant.
+        NotApplicableError: Another plant, or one without sensor noise.
     """
-    model.require_missile(plant, "the augmented filter bank")
+    model.require_missile(plant, "the augmented filter bank", noisy=True)
     R = plant.R[:2, :2]
 
     def init(n: int) -> tuple[Filters, Ratios]:

@@ -91,9 +91,9 @@ def augmented_ekf_imm(
         interaction: Mix the estimates; without it the filters run alone, as in the bank, and only mu is filtered.
 
     Raises:
-        NotApplicableError: Another plant.
+        NotApplicableError: Another plant, or one without sensor noise.
     """
-    model.require_missile(plant, "the interacting filter bank")
+    model.require_missile(plant, "the interacting filter bank", noisy=True)
     R, Pi = plant.R[:2, :2], transition(DT / dwell)
     sigma_theta = RESTART_SD if interaction else ekf.SIGMA_THETA
 

@@ -194,10 +194,10 @@ def innovation_oracle(
         none_allowed: Label 0 is among the candidates inside a window.
 
     Raises:
-        NotApplicableError: Another plant.
+        NotApplicableError: Another plant, or one without sensor noise.
         ValueError (from init): The number of episodes is not that of the scenarios.
     """
-    model.require_missile(plant, "the innovation oracle")
+    model.require_missile(plant, "the innovation oracle", noisy=True)
     scale = float(plant.options["fault_scale"])
     if hard:
         sizes, p_rates, rho, fin = [(0.08, 0.30), (0.08, 0.30), (0.05, 0.20), (0.15, 0.45)], (0.5, 3.0), 0.08, 0.05

@@ -32,7 +32,7 @@ from baselines.reproduction.missile_page import (
 from baselines.reproduction.tables import markdown, pieces
 from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.estimation import missile_model as model
-from fdi_gym.faults import FaultScenario, draw
+from fdi_gym.faults import FaultScenario, Incipient, draw
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants import missile_pitch as missile
 from fdi_gym.simulation import simulate
@@ -82,8 +82,8 @@ def adaptive_bank(plant: Plant, obs: Array, classes: Sequence[int], sigma: Array
 
 def first(condition: Array) -> list[float]:
     """Time [s] at which each row first holds; NaN where never."""
-    held = condition.any(axis=1)
-    return [round(float(k) * DT, 2) if h else math.nan for k, h in zip(condition.argmax(axis=1), held, strict=True)]
+    held = np.asarray(condition.any(axis=1))
+    return [round(float(k) * DT, 2) if h else math.nan for k, h in zip(condition.argmax(axis=1), held.tolist(), strict=True)]
 
 
 def three(values: Sequence[float]) -> list[float]:
@@ -202,11 +202,11 @@ def numbered(seeds: Sequence[int], noise_scale: float, fault_scale: float) -> tu
     scenarios, noise = [], []
     for seed in seeds:
         scenario, (w, v) = missile.episode(seed)
-        faults = [
-            msgspec.structs.replace(f, effects=[
-                e if f.mode == "stuck" else msgspec.structs.replace(e, value=e.value * fault_scale) for e in f.effects
-            ]) for f in scenario.faults
-        ]  # fmt: skip
+        faults = []
+        for fault in scenario.faults:
+            effects = [msgspec.structs.replace(e, value=e.value * fault_scale) if isinstance(e, Incipient) else e
+                       for e in fault.effects]  # fmt: skip
+            faults.append(msgspec.structs.replace(fault, effects=effects))
         scenarios.append(scenario.replace(faults=faults))
         noise.append((w, v * noise_scale))
     return missile.plant(noise_scale=noise_scale, fault_scale=fault_scale), scenarios, noise

@@ -54,10 +54,15 @@ def read(plant: Plant, obs: Array) -> Sample:
     return Sample(y[:, 0], y[:, 1], known[:, 0], known[:, 1], known[:, 2])
 
 
-def require_missile(plant: Plant, method: str) -> None:
-    """Raise `NotApplicableError` on any other plant: what the method needs beyond the dynamics exists only here."""
+def require_missile(plant: Plant, method: str, noisy: bool = False) -> None:
+    """Raise `NotApplicableError` on any other plant: what the method needs beyond the dynamics exists only here.
+
+    `noisy`: the method divides by the sensors' variance, so it cannot run on a plant without noise either.
+    """
     if plant.id != ID:
         raise NotApplicableError(f"{method} needs fault functions and a bound on the model error; {plant.id} has none")
+    if noisy and not plant.R.any():
+        raise NotApplicableError(f"{method} needs sensor noise; with noise_scale = 0 there is none")
 
 
 def _pair(first: Any, second: Any) -> Array:
