@@ -40,9 +40,7 @@ def start(n: int) -> Filters:
                    Sample(nothing, nothing, nothing, nothing, nothing))  # fmt: skip
 
 
-def at_first_sample(
-    sample: Sample, R: Array, sigma_theta: Array = SIGMA_THETA, sigma_rho: float = SIGMA_RHO
-) -> Filters:
+def at_first_sample(sample: Sample, R: Array, sigma_theta: Array = SIGMA_THETA, sigma_rho: float = SIGMA_RHO) -> Filters:
     """The filters at k = 0, before the update: at the measurement. R (2, 2)."""
     z = np.zeros((len(sample.alpha), 6, 6))
     z[..., :2] = sample.y[:, None, :]
