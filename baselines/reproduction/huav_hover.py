@@ -27,7 +27,7 @@ from baselines.reproduction.huav_reference import (
     WRONG_FLAGS,
 )
 from baselines.reproduction.tables import markdown, pieces
-from fdi_gym.diagnosis import Diagnoser, find_diagnoser
+from fdi_gym.diagnosis import Diagnoser, find_diagnoser, guarded
 from fdi_gym.estimation.flags import label_sets
 from fdi_gym.estimation.propagation import fault_inputs
 from fdi_gym.faults import FaultScenario
@@ -46,7 +46,7 @@ NUMBERS = {"bias": "bias", "stuck_at": "stuck at", "stuck_hold": "stuck in place
 
 
 def build(name: str, plant: Plant, **tuning: Any) -> Diagnoser:
-    """The diagnoser itself, without the guard: the measurement reads its state."""
+    """The diagnoser itself: the measurement reads its state."""
     entry = find_diagnoser(name)
     return entry.build(plant, **{**entry.settings, **tuning})
 
@@ -62,16 +62,20 @@ class Watched:
 
 
 def watch(diagnoser: Diagnoser, plant: Plant, channels: tuple[str, ...], obs: Array) -> Watched:
-    """Show the observations to a filter and read its state."""
+    """Show the observations to a filter and read its state, under the guard: after a flight has ended it sees the last
+    observation again and again, and may be lost.
+    """
     inputs = fault_inputs(plant, channels)
     n, samples, p = len(obs), obs.shape[1], len(channels)
     b, s, d = (np.full((n, samples - 1, width), np.nan) for width in (p, p, 2))
     found = Watched(b, s, d, np.zeros((n, samples - 1, p), bool))
     _, sets = label_sets(plant, inputs)
-    state = diagnoser.init(n)
+    guard = guarded(diagnoser, plant)
+    outer = guard.init(n)
     with np.errstate(all="ignore"):
         for k in range(samples):
-            state, said = diagnoser.update(state, obs[:, k])
+            outer, said = guard.update(outer, obs[:, k])
+            state = outer[0]
             if k == 0:
                 continue
             assert said.theta is not None
