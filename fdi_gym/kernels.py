@@ -30,16 +30,15 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numba
 import numpy as np
 import platformdirs
 from numba import boolean, float64, int64, types, void
-from numba.core import cgutils
+from numba.core import cgutils, config
 from numba.extending import intrinsic
 
-F = TypeVar("F", bound=Callable[..., Any])
 V, M = float64[::1], float64[:, ::1]
 
 _MAP = void(float64, V, V, V, V, V, V)
@@ -81,15 +80,16 @@ def _cache_folder(source: str) -> Iterator[bool]:
         cold, writable = True, False
     if cold and own != "interactive":
         print(f"fdi_gym: compiling {Path(source).stem} (once; kept in {base})", file=sys.stderr, flush=True)
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(folder) if writable else before
+    settings: Any = config
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = str(folder) if writable else before
     try:
         yield writable
     finally:
-        numba.config.CACHE_DIR = before
+        settings.CACHE_DIR = before
 
 
-def kernel(function: F) -> F:
+def kernel(function: Callable[..., Any]) -> Any:
     """Compile a plant's function for the role that its parameter names declare (see the module's docstring)."""
     role = _ROLES.get(tuple(inspect.signature(function).parameters))
     if role is None:
@@ -108,7 +108,7 @@ def address(compiled: Any) -> int:
     return result.library.get_pointer_to_function(result.fndesc.llvm_func_name)
 
 
-def _function_at(signature):
+def _function_at(signature: Any) -> Any:
     """An intrinsic that makes numba's first-class function of this signature from an address."""
     function_type = types.FunctionType(signature)
 
@@ -153,7 +153,7 @@ def outside(t, x, r):
 # Generic kernels
 
 
-def _generic(signature):
+def _generic(signature: Any) -> Callable[[Any], Any]:
     """Compile a generic kernel of this file with its explicit signature, cached."""
 
     def decorate(function):
@@ -286,6 +286,7 @@ def evaluate(function_at, t, x, u, theta, d, p, out):
         M,
         V,
         V,
+        int64,
         M,
         M,
         M,
@@ -315,6 +316,7 @@ def simulate(
     sensor_range,
     p,
     nominal,
+    true_feedback,
     X,
     OBS,
     TH,
@@ -335,7 +337,8 @@ def simulate(
     steps, n = w.shape
     p_theta, n_y, n_u = TH.shape[1], v.shape[1], u0.size
     n_n = OBS.shape[1] - n_y - n_u
-    x, u, c, y, out = x0.copy(), u0.copy(), c0.copy(), np.empty(n_y), np.empty(n_n)
+    x, u, c, out = x0.copy(), u0.copy(), c0.copy(), np.empty(n_n)
+    y, fed = np.empty(n_y), np.empty(n_y)
     ak, bk, gk, theta = np.empty(p_theta), np.empty(p_theta), np.empty(p_theta), np.empty(p_theta)
     rk, dk, held = np.empty(r.shape[1]), np.empty(d.shape[1]), np.zeros(holds.shape[0])
     k1, k2, k3, k4, z, last = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
@@ -361,14 +364,16 @@ def simulate(
             theta[j] = ak[j] + bk[j]
         output(t, x, u, theta, dk, p, y)
         for i in range(n_y):
+            fed[i] = y[i]
             y[i] = min(max(y[i] + v[k, i], sensor_range[0, i]), sensor_range[1, i])
             OBS[k, i] = y[i]
+            fed[i] = fed[i] if true_feedback else y[i]
         known(t, rk, c, out)
         for i in range(n_n):
             OBS[k, n_y + n_u + i] = out[i]
         if k == steps or ended:
             return -k if ended else k
-        control(t, y, rk, q, c, u)
+        control(t, fed, rk, q, c, u)
         for i in range(n_u):
             OBS[k + 1, n_y + i] = u[i]
         for h in range(holds.shape[0]):

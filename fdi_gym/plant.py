@@ -129,6 +129,7 @@ class Plant:
         processes: Fault processes by name; must hold "standard".
         c0: Initial state of the controller.
         q: Parameters of the controller.
+        true_feedback: The controller gets the sensors' values before their noise is added; diagnosers never do.
         physical: Maps a scenario's physical parameters to the vector p; of {} it gives the nominal model.
         perturb: Draws physical parameters at a level of mismatch: perturb(rng, level) -> dict, or None if it has none.
         reference: Maps a scenario to the exogenous reference rows (steps + 1, n_r).
@@ -159,6 +160,7 @@ class Plant:
     target: Callable[[Array, Array], Array] | None = None
     c0: Array = field(default_factory=lambda: np.zeros(0))
     q: Array = field(default_factory=lambda: np.zeros(0))
+    true_feedback: bool = False
     physical: Callable[[Mapping[str, Any]], Array] = _no_change
     perturb: Callable[[np.random.Generator, float], Mapping[str, Any]] | None = None
     reference: Callable[[FaultScenario], Array] = _no_rows

@@ -81,7 +81,7 @@ def simulate(plant: Plant, scenarios: Sequence[FaultScenario], noise: Sequence[t
             np.ascontiguousarray(plant.reference(scenario), float), np.ascontiguousarray(d, float),
             *plant.theta_table(scenario), np.ascontiguousarray(w, float), np.ascontiguousarray(v, float), sensor_range,
             np.ascontiguousarray(plant.physical(scenario.physical), float) if scenario.physical else plant.nominal_p,
-            plant.nominal_theta, state[i], obs[i], theta[i],
+            plant.nominal_theta, int(plant.true_feedback), state[i], obs[i], theta[i],
         )  # fmt: skip
         length[i], terminated[i] = abs(flown), flown < 0
         label[i, : steps + 1] = plant.label_rows(scenario)

@@ -1,0 +1,119 @@
+"""Bookkeeping of the satellite's campaign: what counts, and when; and the data sheet's Monte-Carlo figures."""
+
+import numpy as np
+import pytest
+
+from baselines.reproduction.cmg_campaign import (
+    Piece,
+    Watched,
+    campaign,
+    hard_outcome,
+    run_piece,
+    scenarios_of,
+    window_outcome,
+)
+from fdi_gym.faults import FaultScenario
+from fdi_gym.plant import load_plant
+from fdi_gym.plants import cmg_satellite as cmg
+from fdi_gym.simulation import simulate
+
+
+@pytest.fixture(scope="module")
+def plant():
+    return load_plant("CMGSatellite")
+
+
+def perfect(record, flags=()):
+    """A diagnoser that says the truth, with the fault flag up at some samples."""
+    n, samples = record.label.shape
+    flag = np.zeros((n, samples), bool)
+    flag[:, list(flags)] = True
+    return Watched(record.theta.copy(), record.label.copy(), np.zeros((n, samples)), flag, np.zeros(n, int), 0.0)
+
+
+def test_window_bookkeeping(plant):
+    """Window [600, 1000): the label is read over samples 800 to 999, RMSE over 300-599, 601-999 and 1001 on."""
+    scenario = FaultScenario(plant=cmg.ID, steps=1500, faults=[cmg.loss(1, 0.5, 600, 1000)])
+    record = simulate(plant, [scenario])
+    said = perfect(record, flags=[50, 630, 1040])
+    found = window_outcome(record, said, 0, 600, 1000)
+    assert (found["truth"], found["decided"]) == (2, 2)
+    assert found["pre"] == found["faulty"] == found["post"] == 0.0
+    assert found["inside"] == found["scored"] == 1.0
+    assert found["delay"] == pytest.approx(0.30)
+    assert not found["false_alarm"]
+    for samples, name in ((range(300, 600), "pre"), (range(601, 1000), "faulty"), (range(1001, 1501), "post")):
+        spoiled = perfect(record)
+        spoiled.theta[0, list(samples), 3] += 1.0
+        changed = window_outcome(record, spoiled, 0, 600, 1000)
+        assert changed[name] == pytest.approx(0.5)  # one of four units, everywhere
+        assert sum(changed[other] for other in ("pre", "faulty", "post")) == pytest.approx(0.5)
+    spoiled = perfect(record)
+    spoiled.label[0, 800:899] = 7
+    assert window_outcome(record, spoiled, 0, 600, 1000)["decided"] == 2
+    spoiled.label[0, 800:901] = 7
+    assert window_outcome(record, spoiled, 0, 600, 1000)["decided"] == 7
+
+
+def test_hard_bookkeeping(plant):
+    """A change at j: samples j + 101 on count. Segments shorter than 3 s, or cut below it at 5 s, don't."""
+    faults = [cmg.loss(0, 0.3, 450, 900), cmg.loss(1, 0.3, 700, 1300)]
+    scenario = FaultScenario(plant=cmg.ID, steps=2000, faults=faults)
+    record = simulate(plant, [scenario])
+    k = np.arange(2001)
+    scored = (k >= 500) & np.all([(k <= j) | (k - j > 100) for j in (450, 700, 900, 1300)], axis=0)
+    said = perfect(record)
+    said.label[0, ~scored] = 15
+    assert hard_outcome(plant, scenario, record, said, 0)["sample"] == 1.0
+    said = perfect(record)
+    said.label[0, scored] = 15
+    assert hard_outcome(plant, scenario, record, said, 0)["sample"] == 0.0
+    # segments [900, 1300) and [1300, 2000); [500, 700) and [700, 900) are too short
+    said = perfect(record)
+    said.label[0, 1650:1900] = 15
+    assert hard_outcome(plant, scenario, record, said, 0)["segment"] == 0.5
+    said = perfect(record)
+    said.label[0, 500:901] = 15
+    assert hard_outcome(plant, scenario, record, said, 0)["segment"] == 1.0
+
+
+def test_episodes_are_the_same_for_every_method_and_noise_level():
+    pieces = [Piece("bench", "slew", s, m, 1) for s, m in ((45, "UKF"), (75, "MEKF"))]
+    first, second = (scenarios_of(p) for p in pieces)
+    assert first == second
+    assert first != scenarios_of(pieces[0]._replace(block=2))
+    labels = [frozenset(f.mode for f in s.faults) for s in first]
+    assert len(labels) == 30
+    assert len(set(labels)) == 15
+
+
+def test_a_campaign_goes_on_where_it_was(tmp_path):
+    piece = Piece("severity", "slew", 45, "MEKF", 0, 0.5)
+    first = campaign(tmp_path, [piece], 1)
+    (file,) = tmp_path.iterdir()
+    stamp = file.stat().st_mtime_ns
+    assert campaign(tmp_path, [piece], 1) == first
+    assert file.stat().st_mtime_ns == stamp
+    assert np.mean([o["decided"] == o["truth"] for o in first[piece]["outcomes"]]) == 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("method", "rmse"), [("GAUKF", 0.0367), ("SGAUKF", 0.0358), ("MEKF", 0.0372), ("CLAIR", 0.0240)])
+def test_bench_at_45_db(method, rmse):
+    """30 of 30 labels right, mean faulty-phase RMSE as in the data sheet within three standard errors of both."""
+    outcomes = run_piece(Piece("bench", "slew", 45, method, 0))["outcomes"]
+    found = np.array([o["faulty"] for o in outcomes])
+    assert all(o["decided"] == o["truth"] for o in outcomes)
+    assert not any(o["false_alarm"] for o in outcomes)
+    assert abs(found.mean() - rmse) < 3 * found.std(ddof=1) * np.sqrt(2 / 30)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("method", "sample"), [("UKF", 14.6), ("SGAUKF", 55.4), ("MEKF", 52.1), ("CLAIR", 70.7), ("oracle", 96.2)]
+)
+def test_hard_at_45_db(method, sample):
+    """Sample accuracy as in the data sheet (60 episodes there, 30 here) within three standard errors."""
+    outcomes = run_piece(Piece("hard", "slew", 45, method, 0))["outcomes"]
+    found = 100 * np.array([o["sample"] for o in outcomes])
+    assert abs(found.mean() - sample) < 3 * found.std(ddof=1) * np.sqrt(1 / 30 + 1 / 60)
