@@ -155,7 +155,9 @@ def verdicts(r: Results) -> str:
     def claimed_inside(s: int, g: str, claim: float) -> tuple[str, str]:
         o = r.outcomes("table5", g, s, "SGAUKF")
         low, high = wilson(o)
-        return percent(o), verdict(low <= claim <= high, low)
+        return percent(o), (
+            "not measured" if math.isnan(low) else "not excluded at this n" if low <= claim <= high else "not reproduced"
+        )
 
     rest = [rmse("regulate", s, "SGAUKF") for s in (45, 75)]
     moved = [rmse("slew", s, "SGAUKF") for s in (45, 75)]

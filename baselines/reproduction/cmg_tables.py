@@ -231,9 +231,9 @@ def reference_tables(r: Results, bounds: dict[str, list[list[list[float]]]]) -> 
             target = (None, ref.TABLE_4_REGULATE_CLAIR if s == 45 else None, None) if told else (pre, faulty, post)
             rows.append([m, str(s), *(r.mean(v, column(o, c), 1, 3)
                                       for v, c in zip(target, ("pre", "faulty", "post"), strict=True)),
-                         str(int(np.sum(column(o, "flags"))))])  # fmt: skip
+                         "-" if told else str(int(np.sum(column(o, "flags"))))])  # fmt: skip
     parts.append(
-        "Regulate, the source's own case. Flags: steps with the fault flag up (resets for MEKF and CLAIR), all flights.\n\n"
+        "Regulate, the source's own case. Flags: steps with the fault flag up (resets for MEKF), all flights.\n\n"
         + markdown(["method", "dB", "pre", "faulty", "post", "flags"], rows)
     )
     rows = []
@@ -244,8 +244,8 @@ def reference_tables(r: Results, bounds: dict[str, list[list[list[float]]]]) -> 
                 continue
             rows.append([m, str(s), str(len(o)), r.share(accuracy, right(o), 30),
                          *(r.mean(v, column(o, c), 30, 4) for v, c in zip(rmse, ("pre", "faulty", "post"), strict=True)),
-                         str(sum(column(o, "false_alarm"))),
-                         str(sum(not v for v in column(o, "flagged")))])  # fmt: skip
+                         *(["-", "-"] if m == "CLAIR" else [
+                             str(sum(column(o, "false_alarm"))), str(sum(not v for v in column(o, "flagged")))])])  # fmt: skip
     for s, sd in ref.BENCH_ORACLE_SD.items():
         o = r.outcomes("bench", "slew", s, "oracle")
         if not o:
