@@ -222,7 +222,7 @@ def severity_figure(r: Results, path: Path) -> None:
         cells = [r.outcomes("severity", "slew", 45, m, a) for a in SEVERITIES]
         hits = [[v["at_end"] == v["truth"] for v in o] if m == "oracle" else right(o) for o in cells]
         share = [100 * float(np.mean(h)) if h else math.nan for h in hits]
-        style = {"oracle": "k--", "CLAIR": "C3-."}.get(m, "-")
+        style = {"oracle": "k--", "CLAIR": "C3-.", "SGAUKF": "C0-", "MEKF": "C1:"}[m]
         name = {"oracle": "oracle (changes and severity known)", "CLAIR": "CLAIR (changes known)"}.get(m, m)
         ax.plot(SEVERITIES, share, style, marker="o", ms=4, label=name)
     ax.axvline(0.05, color="0.7", lw=1)
