@@ -250,11 +250,12 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
         if answer.theta is not None:
             failed |= ~np.isfinite(answer.theta).all(axis=1)
         if failed.any() or not seen.all():
-            lost = lost | (failed & seen)
+            fresh = failed & seen
+            lost = lost | fresh
             after = _choose(seen & ~lost, after, inner)
-            if lost.any():
-                after = _choose(lost, raw.init(n), after)
-            kept = Diagnosis(*(a if b is not None and a is not None else b for a, b in zip(last, answer, strict=True)))
+            if fresh.any():  # where it stays, out of harm's way; shared counters are those of the episodes that go on
+                after = _choose(~fresh, after, raw.init(n))
+            kept: Any = Diagnosis._make(b if a is None or b is None else a for a, b in zip(last, answer, strict=True))
             answer = _choose(seen & ~lost, answer, kept)
             theta = None if answer.theta is None else np.where(lost[:, None], np.nan, answer.theta)
             answer = answer._replace(alarm=answer.alarm & ~lost, mode=np.where(lost, -1, answer.mode), theta=theta)

@@ -104,7 +104,7 @@ class _Game:
             value = self.low + (self.high - self.low) * (value.astype(np.float64) + 1) / 2
         return np.clip(value, self.low, self.high)
 
-    def reward(self, action: Array, label: Array, target: Array) -> Any:
+    def reward(self, action: Array, label: Any, target: Array) -> Any:
         """What a checked action is worth where the truth is label (...) and target (..., n)."""
         if self.task == "isolation":
             return self.plant.isolation_reward[label, action]  # type: ignore[index]
@@ -305,7 +305,7 @@ class FDIVectorEnv(VectorEnv):
         """Begin new episodes, in all environments or in those of `options["reset_mask"]` (a bool array)."""
         if isinstance(seed, (int, np.integer)):
             seed = [int(seed) + i for i in range(self.num_envs)]
-        seeds = [None] * self.num_envs if seed is None else list(seed)
+        seeds: list[int | None] = [None] * self.num_envs if seed is None else list(seed)
         if len(seeds) != self.num_envs:
             raise ValueError(f"one seed per environment is needed: {self.num_envs}, not {len(seeds)}")
         mask = (options or {}).get("reset_mask")
@@ -367,9 +367,8 @@ class FDIVectorEnv(VectorEnv):
         infos: dict[str, Any] = {}
         if self._mode is AutoresetMode.SAME_STEP:
             begin = np.flatnonzero(ended)
-            for i in begin:
-                final = {"final_obs": self._block(i), "final_info": self._info(i)}
-                infos = self._add_info(infos, final, int(i))
+            for i in begin.tolist():
+                infos = self._add_info(infos, {"final_obs": self._block(i), "final_info": self._info(i)}, i)
         self._over = ended
         if begin.size:
             self._begin(begin, [None] * self.num_envs)

@@ -200,17 +200,16 @@ def diagnose(suite: Suite, plant: Plant, name: str, episodes: Sequence[int], rec
     return Block(outcomes, seconds, int((record.length + 1).sum()))
 
 
-def _blocks(suite: Suite) -> list[range]:
-    return [range(i, min(i + BLOCK, suite.episodes)) for i in range(0, suite.episodes, BLOCK)]
+def _blocks(suite: Suite, size: int) -> list[range]:
+    return [range(i, min(i + size, suite.episodes)) for i in range(0, suite.episodes, size)]
 
 
 def _block_path(folder: Path, name: str, index: int) -> Path:
     return folder / name.replace(":", ".") / f"block-{index:04d}.json"
 
 
-def _run_block(suite: Suite, names: Sequence[str], index: int, folder: Path) -> int:
+def _run_block(suite: Suite, names: Sequence[str], index: int, episodes: range, folder: Path) -> int:
     """Fly one block once and show it to every diagnoser that has not seen it."""
-    episodes = _blocks(suite)[index]
     missing = [name for name in names if not _block_path(folder, name, index).exists()]
     if missing:
         plant = suite.build()
@@ -253,7 +252,14 @@ def applicable(suite: Suite, plant: Plant, names: Sequence[str]) -> tuple[list[s
 
 
 def evaluate(
-    suite: Suite, names: Sequence[str], *, work: Path, jobs: int = -1, progress: bool = True, command: str = ""
+    suite: Suite,
+    names: Sequence[str],
+    *,
+    work: Path,
+    jobs: int = -1,
+    progress: bool = True,
+    command: str = "",
+    block: int = BLOCK,
 ) -> tuple[dict[str, Row], dict[str, float]]:
     """Rows of diagnosers on a suite, and their microseconds per sample.
 
@@ -264,6 +270,7 @@ def evaluate(
         jobs: Worker processes, -1 for one per core. A joblib backend (Ray, Dask) is used if one is active.
         progress: Show a progress bar.
         command: What to type to get these rows again.
+        block: Episodes flown and diagnosed together.
 
     Raises:
         ValueError: The suite's scenarios are not those that were frozen, or an unknown diagnoser.
@@ -271,16 +278,15 @@ def evaluate(
     plant = suite.build()
     if scenarios_digest(suite.scenarios(plant, range(suite.episodes))) != suite.scenarios_sha256:
         raise ValueError(f"{suite.name}: this version draws other scenarios than the suite was frozen with")
-    folder = work / f"{suite.name}-{suite.sha256[:8]}-{_source_digest(names)[:8]}"
-    tasks = [joblib.delayed(_run_block)(suite, names, i, folder) for i in range(len(_blocks(suite)))]
+    folder = work / f"{suite.name}-{suite.sha256[:8]}-{_source_digest(names)[:8]}-{block}"
+    ranges = _blocks(suite, block)
+    tasks = [joblib.delayed(_run_block)(suite, names, i, episodes, folder) for i, episodes in enumerate(ranges)]
     parallel = joblib.Parallel(n_jobs=min(jobs, len(tasks)), return_as="generator_unordered")
     for _ in tqdm(parallel(tasks), total=len(tasks), desc=suite.name, unit="block", disable=not progress):
         pass
     rows, timing = {}, {}
     for name in names:
-        blocks = [
-            msgspec.json.decode(_block_path(folder, name, i).read_bytes(), type=Block) for i in range(len(_blocks(suite)))
-        ]
+        blocks = [msgspec.json.decode(_block_path(folder, name, i).read_bytes(), type=Block) for i in range(len(ranges))]
         outcomes = [episode for block in blocks for episode in block.outcomes]
         entry = find_diagnoser(name)
         row = Row(

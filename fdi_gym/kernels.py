@@ -30,16 +30,15 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numba
 import numpy as np
 import platformdirs
 from numba import boolean, float64, int64, types, void
-from numba.core import cgutils
+from numba.core import cgutils, config
 from numba.extending import intrinsic
 
-F = TypeVar("F", bound=Callable[..., Any])
 V, M = float64[::1], float64[:, ::1]
 
 _MAP = void(float64, V, V, V, V, V, V)
@@ -81,15 +80,16 @@ def _cache_folder(source: str) -> Iterator[bool]:
         cold, writable = True, False
     if cold and own != "interactive":
         print(f"fdi_gym: compiling {Path(source).stem} (once; kept in {base})", file=sys.stderr, flush=True)
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(folder) if writable else before
+    settings: Any = config
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = str(folder) if writable else before
     try:
         yield writable
     finally:
-        numba.config.CACHE_DIR = before
+        settings.CACHE_DIR = before
 
 
-def kernel(function: F) -> F:
+def kernel(function: Callable[..., Any]) -> Any:
     """Compile a plant's function for the role that its parameter names declare (see the module's docstring)."""
     role = _ROLES.get(tuple(inspect.signature(function).parameters))
     if role is None:
@@ -108,7 +108,7 @@ def address(compiled: Any) -> int:
     return result.library.get_pointer_to_function(result.fndesc.llvm_func_name)
 
 
-def _function_at(signature):
+def _function_at(signature: Any) -> Any:
     """An intrinsic that makes numba's first-class function of this signature from an address."""
     function_type = types.FunctionType(signature)
 
@@ -153,7 +153,7 @@ def outside(t, x, r):
 # Generic kernels
 
 
-def _generic(signature):
+def _generic(signature: Any) -> Callable[[Any], Any]:
     """Compile a generic kernel of this file with its explicit signature, cached."""
 
     def decorate(function):

@@ -127,6 +127,7 @@ def row_path(results: Path, suite: str, diagnoser: str) -> Path:
 
 def write_rows(results: Path, suite: Suite, rows: dict[str, Row], timing: dict[str, float]) -> None:
     """Write rows, and their times per sample into timing.json beside them."""
+    (results / suite.name).mkdir(parents=True, exist_ok=True)
     for name, row in rows.items():
         write_whole(row_path(results, suite.name, name), msgspec.json.encode(row) + b"\n")
     path = results / suite.name / "timing.json"

@@ -104,7 +104,7 @@ def _spans(mask: Array) -> list[tuple[int, int]]:
     return [(max(int(a) - 1, 0), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def flight(plant: Plant, record: Record, said: dict[str, Any], i: int = 0) -> Any:
+def flight(plant: Plant, record: Record, said: dict[str, Any], i: int = 0, entries: Sequence[int] | None = None) -> Any:
     """A figure of one recorded flight with the diagnoses of several methods: labels, then the estimated entries.
 
     Args:
@@ -112,11 +112,13 @@ def flight(plant: Plant, record: Record, said: dict[str, Any], i: int = 0) -> An
         record: The flights.
         said: Decisions by name of the method.
         i: Which flight.
+        entries: Which estimated entries are shown; default the first four.
     """
     from matplotlib.figure import Figure
 
     estimates = {name: d for name, d in said.items() if d.theta is not None}
-    rows = 1 + min(len(plant.estimated), 4)
+    shown = list(range(min(len(plant.estimated), 4))) if entries is None else list(entries)
+    rows = 1 + len(shown)
     figure = Figure(figsize=(9.6, 1.6 + 1.5 * rows), dpi=120, layout="constrained")
     axes = figure.subplots(rows, 1, sharex=True)
     length = int(record.length[i]) + 1
@@ -126,7 +128,7 @@ def flight(plant: Plant, record: Record, said: dict[str, Any], i: int = 0) -> An
     for colour, (name, decisions) in zip(colours, said.items(), strict=False):
         axes[0].step(t, decisions.mode[i, :length], where="post", color=colour, lw=1.1, label=name)
     axes[0].set_yticks(range(len(plant.labels)), [entry.name for entry in plant.labels], fontsize=7)
-    for j, axis in enumerate(axes[1:]):
+    for j, axis in zip(shown, axes[1:], strict=True):
         axis.plot(t, record.target[i, :length, j], color=TRUTH, lw=3.5, alpha=0.5)
         for colour, (name, decisions) in zip(colours, said.items(), strict=False):
             if name in estimates:

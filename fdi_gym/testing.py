@@ -52,8 +52,8 @@ def check_plant(plant: Plant, seeds: Sequence[int] = range(5)) -> None:
 def _check_record(plant: Plant, name: str, scenarios: Sequence[FaultScenario], record: Record) -> None:
     low, high = (np.array([getattr(s, end) for s in plant.observed]) for end in ("low", "high"))
     assert np.isfinite(record.obs).all(), f"{name}: an observation is not finite"
-    beyond = ((record.obs < low) | (record.obs > high)).any(axis=(0, 1))
-    outside = [signal.name for signal, left in zip(plant.observed, beyond, strict=True) if left]
+    beyond: Array = np.logical_or(record.obs < low, record.obs > high)
+    outside = [signal.name for j, signal in enumerate(plant.observed) if beyond[:, :, j].any()]
     assert not outside, f"{name}: observations leave their declared range: {outside}"
     assert (record.label[:, 0] == 0).all(), f"{name}: no interval has ended at sample 0, its label is 'none'"
     _, u, _ = plant.split(record.obs)
@@ -219,13 +219,17 @@ def check_diagnoser(
         assert not (said.theta_std < 0).any(), "a standard deviation is negative"
     _equal(said, run(fresh(everyone), obs), "a second run differs: not deterministic")
     alone = run(fresh([2]), obs[2:3])
-    _equal(Decisions(*(None if a is None else a[2:3] for a in said)), alone, "an episode depends on its batch", 1e-6)
+    _equal(_pick(said, slice(2, 3)), alone, "an episode depends on its batch", 1e-6)
     # no look-ahead: what is said up to a sample does not change with what comes after it
     half = samples // 2
     changed = obs.copy()
     changed[:, half:] = changed[:, :1]
     other = run(fresh(everyone), changed)
-    _equal(_cut(said, half), _cut(other, half), "what it says depends on later samples")
+    _equal(
+        _pick(said, slice(None), slice(half)),
+        _pick(other, slice(None), slice(half)),
+        "what it says depends on later samples",
+    )
     # a dropout in one episode: that one goes on, the others don't notice
     holes = obs.copy()
     holes[1, half, 0] = np.nan
@@ -237,12 +241,9 @@ def check_diagnoser(
     assert hurt.theta is None or np.isfinite(hurt.theta[1]).all(), "a dropout leaves a NaN in the estimate"
 
 
-def _pick(said: Decisions, which: Sequence[int]) -> Decisions:
-    return Decisions(*(None if a is None else a[which] for a in said))
-
-
-def _cut(said: Decisions, stop: int) -> Decisions:
-    return Decisions(*(None if a is None else a[:, :stop] for a in said))
+def _pick(said: Decisions, which: Sequence[int] | slice, samples: slice = slice(None)) -> Decisions:
+    chosen = {name: None if a is None else a[which][:, samples] for name, a in said._asdict().items()}
+    return Decisions(**chosen)  # type: ignore[arg-type]
 
 
 def _equal(left: Decisions, right: Decisions, what: str, tolerance: float = 0.0) -> None:

@@ -87,8 +87,8 @@ def switching_bayes_bank(plant: Plant, *, gamma: tuple[float, float] = (-0.7, -0
             w_healthy = w_healthy + np.log1p(-P_BEGIN)
             tau, off = (*begun.tolist(), step), (*(None if o < 0 else int(o) for o in ended), None)
         x, nu = nominal.step(x, u, y)
+        gone = np.array([o is not None for o in off], bool)
         if tau:
-            gone = np.array([o is not None for o in off])
             E = nominal.model.E(u)[:, None] * ~gone[:, None, None]
             M, G, g = sense(M, G, g, E, nu, nominal)
         if k % GRID == 0 and tau:

@@ -66,15 +66,24 @@ def forget(Pz: Array, rule: str, factor: float, a_min: float, a_max: float) -> A
 
     "directional" (bounded): a -> a_min + a (a_max - a_min) / a_max below a_max. "exponential" (capped): a -> a / factor
     up to a_max. An eigenvalue above a_max stays. "none": nothing happens.
+
+    Below the cap both rules are linear in Pz and need no eigenvalues; the Frobenius norm bounds the largest one.
     """
     if rule == "none":
         return Pz
-    a, e = np.linalg.eigh(symmetric(Pz))
     if rule == "directional":
-        a = np.where(a <= a_max, a_min + a * (a_max - a_min) / a_max, a)
+        limit, aged = a_max, a_min * np.eye(Pz.shape[-1]) + Pz * ((a_max - a_min) / a_max)
     else:
-        a = np.maximum(a, np.minimum(a / factor, a_max))
-    return (e * a[:, None, :]) @ T(e)
+        limit, aged = factor * a_max, Pz / factor
+    capped = (Pz * Pz).sum(axis=(1, 2)) > limit * limit
+    if capped.any():
+        a, e = np.linalg.eigh(symmetric(Pz[capped]))
+        if rule == "directional":
+            a = np.where(a <= a_max, a_min + a * (a_max - a_min) / a_max, a)
+        else:
+            a = np.maximum(a, np.minimum(a / factor, a_max))
+        aged[capped] = (e * a[:, None, :]) @ T(e)
+    return aged
 
 
 def step(s: TwoStage, u: Array, y: Array, model: LinearModel, Q: Array, R: Array, Pz_minus: Array) -> TwoStage:
@@ -82,18 +91,20 @@ def step(s: TwoStage, u: Array, y: Array, model: LinearModel, Q: Array, R: Array
     A, B, C = model.A, model.B, model.C
     W = A @ s.V + model.E(u)
     WPz = W @ s.Pz
-    V = right_divide(WPz, Pz_minus)
+    V = W if Pz_minus is s.Pz else right_divide(WPz, Pz_minus)
     H = C @ V
     x = times(A, s.x) + times(B, u) + times(W - V, s.z)
-    Px = symmetric(A @ s.Px @ A.T + Q + WPz @ T(W) - V @ Pz_minus @ T(V))
+    # W Pz W' - V Pz- V', with V Pz- = W Pz
+    Px = symmetric(A @ s.Px @ A.T + Q + WPz @ T(W - V))
     r = y - times(C, x)
-    S = C @ Px @ C.T + R
-    Kx = right_divide(Px @ C.T, S)
+    CPx = C @ Px
+    S = CPx @ C.T + R
+    Kx = T(np.linalg.solve(S, CPx))
     x = x + times(Kx, r)
-    Px = symmetric(Px - Kx @ (C @ Px))
+    Px = symmetric(Px - Kx @ CPx)
     HPz = H @ Pz_minus
     Sz = HPz @ T(H) + S
-    Kz = right_divide(T(HPz), Sz)
+    Kz = T(np.linalg.solve(Sz, HPz))
     nu = r - times(H, s.z)
     z = s.z + times(Kz, nu)
     Pz = symmetric(Pz_minus - Kz @ HPz)

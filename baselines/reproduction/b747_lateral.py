@@ -262,6 +262,7 @@ def main(arguments: Arguments) -> None:
     folder = arguments.work / ("quick" if arguments.quick else "full")
     found = pieces(folder, jobs, arguments.workers)
     arguments.page.parent.mkdir(parents=True, exist_ok=True)
+    picture(arguments.page.with_name("rudder.png"))
     arguments.page.write_text(page(found, seeds, per_group, count, hard))
     print(arguments.page)
 
@@ -375,6 +376,18 @@ def page(found: dict[str, Any], seeds: int, per_group: int, count: int, hard: in
     return "\n".join(parts)
 
 
+def picture(path: Path) -> None:
+    """The paper's scenario as three two-stage filters see it."""
+    from fdi_gym.plants.b747_lateral import paper
+    from fdi_gym.plots import flight
+
+    plant = load_plant("B747Lateral")
+    record = simulate(plant, [paper().replace(noise_seed=500_000)])
+    names = {"exponential forgetting": "two_stage_kf_exponential", "no forgetting": "two_stage_kf"}
+    said = {label: run(make_diagnoser(name, plant), record.obs) for label, name in names.items()}
+    flight(plant, record, said, entries=(1, 3)).savefig(path)
+
+
 INTRODUCTION = """# Boeing 747: the reference figures, measured again
 
 Written by `python -m baselines.reproduction.b747_lateral`. Every cell reads "reference / measured here"; the reference
@@ -389,6 +402,8 @@ not accuracies. The delays of the known-onset reference were read at every tenth
 What the paper claims: the rudder's stuck fault is detected and isolated, and the estimates converge to (-1, 2). That
 holds with a random-walk bias or forgetting only; the plain constant-bias filter is right about neither after 400 s,
 when the fault begins after 200 s of healthy flight.
+
+![The paper's scenario](rudder.png)
 """
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ class LinearModel(NamedTuple):
 
     def E(self, u: Array) -> Array:
         """dx+/dtheta under the command u (n, n_u): (n, n_x, n_theta)."""
-        return self.E0 + np.tensordot(u, self.Eu, axes=1)
+        return self.E0 + (u @ self.Eu.reshape(len(self.Eu), -1)).reshape(-1, *self.E0.shape)
 
 
 def linear_model(plant: Plant) -> LinearModel:

@@ -1,0 +1,184 @@
+"""How a Gaussian over the state passes through a nonlinear plant, and how the unknown inputs enter on the way.
+
+Two rules, central differences (Stirling's interpolation) and the extended Kalman filter's linearisation. Either gives
+the mean and spread after one sample together with the plant's Jacobians with respect to the state, to a fault vector b
+and to a disturbance d: what the three-stage filters need. Everything a rule needs of the plant is one compiled call for
+the whole batch of episodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fdi_gym.diagnosis import NotApplicableError
+from fdi_gym.estimation.kalman import T, symmetric
+from fdi_gym.plant import Array, Plant
+
+
+class FaultInputs(NamedTuple):
+    """Where the fault vector b (n, p) that a filter estimates enters the plant: theta = nominal + b on `entries`."""
+
+    names: tuple[str, ...]
+    estimated: Array  # (p,) positions in plant.estimated
+    entries: Array  # (p,) positions in plant.theta
+
+    def theta(self, plant: Plant, b: Array) -> Array:
+        """The fault parameter (n, n_theta) that b (n, p) stands for."""
+        theta = np.tile(plant.nominal_theta, (len(b), 1))
+        theta[:, self.entries] += b
+        return theta
+
+
+def fault_inputs(plant: Plant, channels: Sequence[str] | None = None) -> FaultInputs:
+    """The fault vector of a plant: the named entries of `plant.estimated`, all of them by default.
+
+    An estimated quantity is a theta entry of the same name, or it is the error of a command, which enters additively
+    through the theta entry "offset_<name>".
+
+    Raises:
+        NotApplicableError: An unknown name, or a quantity that is neither.
+    """
+    asked, entries = [s.name for s in plant.estimated], [s.name for s in plant.theta]
+    names = tuple(asked if channels is None else channels)
+    if not names or set(names) - set(asked) or len(set(names)) < len(names):
+        raise NotApplicableError(f"channels are different ones of {', '.join(asked)}, not {', '.join(names) or 'none'}")
+    found = []
+    for name in names:
+        entry = name if name in entries else f"offset_{name}"
+        if entry not in entries:
+            raise NotApplicableError(f"{plant.id} has no theta entry through which {name!r} enters additively")
+        found.append(entries.index(entry))
+    return FaultInputs(names, np.array([asked.index(n) for n in names]), np.array(found))
+
+
+def linear_output(plant: Plant) -> Array:
+    """H (n_y, n_x) of a plant with y = H x.
+
+    Raises:
+        NotApplicableError: The sensors are not linear in the state, or see the command, a fault or the disturbance.
+    """
+    n_x = len(plant.states)
+    rng = np.random.default_rng(0)
+    H = (plant.measure(0.0, np.eye(n_x), plant.trim_command) - plant.measure(0.0, np.zeros(n_x), plant.trim_command)).T
+    x = rng.standard_normal((8, n_x))
+    u = plant.trim_command + rng.standard_normal((8, len(plant.commands)))
+    theta = plant.nominal_theta + rng.standard_normal((8, len(plant.theta)))
+    d = rng.standard_normal((8, len(plant.disturbances))) if plant.disturbances else None
+    if not np.allclose(plant.measure(0.0, x, u, theta, d), x @ H.T, rtol=1e-9, atol=1e-9):
+        raise NotApplicableError(f"needs sensors y = H x; those of {plant.id} are not")
+    return H
+
+
+class Propagated(NamedTuple):
+    """What a rule gives. The Jacobian with respect to the state is A = D S^-1."""
+
+    x: Array  # (n, n_x) mean after the sample
+    P: Array  # (n, n_x, n_x) spread, process noise not included
+    D: Array  # (n, n_x, n_x) how the spread's columns come out,
+    S: Array | None  # (n, n_x, n_x) and how they went in; None: the identity
+    B: Array  # (n, n_x, p) Jacobian with respect to the fault vector
+    E: Array  # (n, n_x, q) and the disturbance
+
+    def carry(self, V: Array) -> Array:
+        """A V for V (n, n_x, m)."""
+        return self.D @ (V if self.S is None else np.linalg.solve(self.S, V))
+
+    @property
+    def A(self) -> Array:
+        """The Jacobian itself (n, n_x, n_x)."""
+        return self.D if self.S is None else self.carry(np.tile(np.eye(self.D.shape[-1]), (len(self.D), 1, 1)))
+
+
+Rule = Callable[..., Propagated]  # rule(t, x (n, n_x), P (n, n_x, n_x), u (n, n_u), b (n, p), d (n, q))
+
+
+def _steps(plant: Plant, inputs: FaultInputs, ahead: int, step_b: float, step_d: float) -> tuple[Array, Array]:
+    """Offsets of theta (m, n_theta) and d (m, q): none for the first `ahead` points, then +-step on each b and d."""
+    p, q = len(inputs.entries), len(plant.disturbances)
+    m = ahead + 2 * p + 2 * q
+    theta, d = np.zeros((m, len(plant.theta))), np.zeros((m, q))
+    for j, entry in enumerate(inputs.entries):
+        theta[ahead + j, entry], theta[ahead + p + j, entry] = step_b, -step_b
+    for j in range(q):
+        d[ahead + 2 * p + j, j], d[ahead + 2 * p + q + j, j] = step_d, -step_d
+    return theta, d
+
+
+def _differences(F: Array, ahead: int, p: int, q: int, step_b: float, step_d: float) -> tuple[Array, Array]:
+    """B and E from the points that `_steps` laid out."""
+    b, d = F[:, ahead : ahead + 2 * p], F[:, ahead + 2 * p :]
+    return T(b[:, :p] - b[:, p:]) / (2 * step_b), T(d[:, :q] - d[:, q:]) / (2 * step_d)
+
+
+def central_difference_points(x: Array, S: Array, h: float) -> Array:
+    """x, x + h s_i, x - h s_i for the columns s_i of S: (n, 2 n_x + 1, n_x)."""
+    spread = h * T(S)
+    return np.concatenate([x[:, None], x[:, None] + spread, x[:, None] - spread], axis=1)
+
+
+def central_difference_moments(F: Array, h: float) -> tuple[Array, Array, Array]:
+    """Mean, spread D1 D1' + D2 D2' and D1 of the points' images F (n, 2 N + 1, n_x)."""
+    N = F.shape[1] // 2
+    centre, plus, minus = F[:, :1], F[:, 1 : N + 1], F[:, N + 1 :]
+    both = plus + minus
+    mean = (h**2 - N) / h**2 * centre[:, 0] + both.sum(axis=1) / (2 * h**2)
+    D1 = T(plus - minus) / (2 * h)
+    D2 = T(both - 2 * centre) * (np.sqrt(h**2 - 1) / (2 * h**2))
+    D = np.concatenate([D1, D2], axis=2)
+    return mean, D @ T(D), D1
+
+
+def central_difference_rule(
+    plant: Plant, inputs: FaultInputs, *, h: float = 3**0.5, step_b: float = 1e-3, step_d: float = 0.1
+) -> Rule:
+    """Second-order central differences with interval h (h^2 = kurtosis 3 of a Gaussian); A = D1 S^-1, P = S S'.
+
+    Norgaard, Poulsen, Ravn, Automatica 36(11), 2000. B and E are plain central differences with the given steps.
+    """
+    n_x, p, q = len(plant.states), len(inputs.entries), len(plant.disturbances)
+    ahead = 2 * n_x + 1
+    step_theta, step_dist = _steps(plant, inputs, ahead, step_b, step_d)
+
+    def rule(t: Any, x: Array, P: Array, u: Array, b: Array, d: Array) -> Propagated:
+        S = np.linalg.cholesky(P)
+        points = np.empty((len(x), len(step_theta), n_x))
+        points[:, :ahead] = central_difference_points(x, S, h)
+        points[:, ahead:] = x[:, None]
+        theta = inputs.theta(plant, b)[:, None] + step_theta
+        F = plant.propagate(t, points, u, theta, d[:, None] + step_dist if q else None)
+        mean, Pf, D1 = central_difference_moments(F[:, :ahead], h)
+        return Propagated(mean, Pf, D1, S, *_differences(F, ahead, p, q, step_b, step_d))
+
+    return rule
+
+
+def extended_rule(
+    plant: Plant, inputs: FaultInputs, *, step_x: float = 1e-5, step_b: float = 1e-5, step_d: float = 1e-3
+) -> Rule:
+    """The mean goes through the plant, the spread through its Jacobian A P A'; central differences with these steps."""
+    n_x, p, q = len(plant.states), len(inputs.entries), len(plant.disturbances)
+    ahead = 2 * n_x + 1
+    step_theta, step_dist = _steps(plant, inputs, ahead, step_b, step_d)
+    step_state = np.zeros((len(step_theta), n_x))
+    step_state[1 : n_x + 1], step_state[n_x + 1 : ahead] = step_x * np.eye(n_x), -step_x * np.eye(n_x)
+
+    def rule(t: Any, x: Array, P: Array, u: Array, b: Array, d: Array) -> Propagated:
+        theta = inputs.theta(plant, b)[:, None] + step_theta
+        F = plant.propagate(t, x[:, None] + step_state, u, theta, d[:, None] + step_dist if q else None)
+        A = T(F[:, 1 : n_x + 1] - F[:, n_x + 1 : ahead]) / (2 * step_x)
+        return Propagated(F[:, 0], symmetric(A @ P @ T(A)), A, None, *_differences(F, ahead, p, q, step_b, step_d))
+
+    return rule
+
+
+def trim_model(plant: Plant, inputs: FaultInputs) -> Propagated:
+    """The linearisation at trim: A (n_x, n_x), B (n_x, p), E (n_x, q), with the trim state after one sample as x."""
+    n_x, zero = len(plant.states), np.zeros((1, len(inputs.entries)))
+    found = extended_rule(plant, inputs)(
+        0.0, plant.trim_state[None], np.eye(n_x)[None], plant.trim_command[None], zero,
+        np.zeros((1, len(plant.disturbances))),
+    )  # fmt: skip
+    return Propagated(found.x[0], found.P[0], found.D[0], None, found.B[0], found.E[0])

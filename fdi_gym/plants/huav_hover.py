@@ -1,0 +1,530 @@
+"""Helicopter UAV in hover, with actuator faults under wind gusts.
+
+A small single-rotor helicopter with a Bell-Hiller stabiliser bar, held in hover by a discrete LQI controller. SI units,
+angles in radians; x forward, y right, z down.
+
+    xdot = f(x, u_true) + E_c d,   u_true = gain u_c + offset,   y = x[0:9] + v
+
+| vector | entries |
+|---|---|
+| state x | body velocities u, v, w [m/s]; rates p, q, r [rad/s]; attitude phi, theta, psi [rad]; stabiliser flapping |
+| | a1f (positive aft), b1f (positive right) [rad] |
+| command u_c | collective col, longitudinal lon and lateral lat cyclic, pedal ped [rad]; clipped |
+| fault theta | gain of each actuator (nominal 1) and offset of each [rad] (nominal 0) |
+| estimated b | the actuator error u_true - u_c of each actuator [rad], whatever its cause |
+| disturbance d | horizontal gust velocity u_g, v_g in body axes [m/s], not measured |
+
+Faults, each on any actuator: bias (offset), loss of effectiveness (gain), stuck at a position or floating (gain 0, the
+position in the offset: a constant, a square wave or a random drift), stuck in place (gain 0, offset held at the command
+of the step before the onset). Up to two actuators fail at once: 11 labels.
+
+Model: rotor thrust in hover solves T + D sqrt(T) = C angle (blade element with momentum inflow), torque is
+C_Q T^1.5 + D_Q; the tip-path plane follows swash plate and stabiliser bar (A1 = K_B lon + K_F a1f, B1 likewise) and
+acts through the thrust's tilt and the hub spring. No aerodynamic damping, no Coriolis terms: open loop has seven zero
+eigenvalues, so a controller is indispensable. Servos without lag.
+
+Gusts: each component builds up as 1 - cos, holds, and dies down. `kappa` is the share of the tail rotor's weathercock
+coupling that is kept: 0 a force-only gust (the source's setting), 1 the physical one, where a side gust looks like a
+pedal fault; the level of difficulty.
+
+The flight ends early beyond 60 deg of roll or pitch, 20 m/s or 8 rad/s in any axis: a stuck or floating cyclic can
+bring that about. Mismatch multiplies mass and inertias by 1 + level * U(-1, 1).
+
+Processes: "standard" (0, 1 or 2 faults, random gusts; flight `episode(seed)` of the benchmark's own numbering), "hard"
+(the same with the full coupling kappa = 1 in the truth; build the plant with kappa=1 where the diagnosers shall know
+it), "fault-free", and "scenario-1" to "scenario-4" of the source ("paper" is "scenario-1"; "scenario-4" is the same
+flight with all filters side by side).
+
+Noise is prescribed: from default_rng(noise seed) first w (steps, 11), then v (steps + 1, 9).
+
+Source: Z. Nejati et al., International Journal of Engineering, Transactions B 34(5), 2021, pp. 1290-1296,
+doi 10.5829/ije.2021.34.05b.23 (structure, fault scenarios). Masses and rotor data: V. Gavrilets, Handbook of Unmanned
+Aerial Vehicles, Springer 2015, pp. 279-306, doi 10.1007/978-90-481-9707-1_54 (X-Cell .60). Reconstructed where the
+source is silent or misprinted: signs of thrust and tail rotor, the square root in the thrust, psi', controller, noise,
+sample time, gust numbers; the randomised process is this benchmark's.
+
+Version history: v0, the first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Hold, Samples, Scoring, Square
+from fdi_gym.kernels import kernel
+from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
+
+ID = "HUAVHover"
+VERSION = 0
+
+DT = 0.02  # s
+STEPS = 1000  # 20 s
+CHANNELS = ("col", "lon", "lat", "ped")
+STATES = ("u", "v", "w", "p", "q", "r", "phi", "theta", "psi", "a1f", "b1f")
+U_MIN = (-0.02, -0.12, -0.12, -0.20)  # rad: command limits
+U_MAX = (0.20, 0.12, 0.12, 0.25)
+SIGMA_V = (0.05, 0.05, 0.05, 0.005, 0.005, 0.005, 0.009, 0.009, 0.009)  # m/s, rad/s, rad: sensors
+SIGMA_W = (*(0.004,) * 3, *(0.005,) * 3, *(2e-4,) * 5)  # m/s, rad/s, rad, rad (flapping) per step: process
+B_MAX = (0.25, 0.15, 0.15, 0.50)  # rad: a stuck actuator lets |b| grow to the command limit
+B_SCALE = (0.005, 0.002, 0.002, 0.008)  # rad: error that costs 1 in the identification task
+
+G = 9.81  # m/s^2
+RHO = 1.225  # kg/m^3, sea level
+MASS, JXX, JYY, JZZ = 8.2, 0.18, 0.34, 0.28  # kg, kg m^2, X-Cell .60
+H_MR, D_TR, H_TR = 0.235, 0.91, 0.08  # m: hub above, tail rotor behind and above the centre of mass
+R_MR, OM_MR = 0.775, 167.0  # m, rad/s: main rotor
+R_TR, OM_TR = 0.13, 4.66 * OM_MR  # tail rotor, geared to the main one
+C_MR, A_MR, CD0_MR = 0.058, 5.5, 0.024  # chord [m], lift slope [1/rad], profile drag
+C_TR, A_TR, CD0_TR = 0.029, 5.0, 0.024
+BLADES = 2
+K_BETA = 54.0  # N m/rad: hub spring
+S_X, S_Y = 0.1, 0.22  # m^2: drag areas of the fuselage
+TAU_F = 16 / (0.8 * OM_MR)  # s: stabiliser bar, Lock number 0.8
+PER_TAU_F = 1 / TAU_F
+K_F = 1.0  # stabiliser flapping to tip-path plane
+A_CYC = 4.2  # static swash plate to tip-path plane, K_B + K_H K_F
+OFFSET_PED = 0.206  # rad: blade angle at zero pedal, so that the trim pedal is about -0.01
+
+
+def rotor_constants(om: float, r: float, c: float, a: float, cd0: float) -> tuple[float, float, float, float]:
+    """C_T [N/rad], D_T [N^0.5], C_Q [m N^-0.5] and D_Q [N m] of a rotor with speed, radius, chord, lift slope, drag."""
+    area, solidity = np.pi * r**2, BLADES * c / (np.pi * r)
+    force = RHO * area * (om * r) ** 2
+    return (
+        float(force * a * solidity / 6),
+        float(a * solidity / 4 * np.sqrt(force / 2)),
+        float(1 / (om * np.sqrt(2 * RHO * area))),
+        float(force * r * solidity * cd0 / 8),
+    )
+
+
+CT_M, DT_M, CQ_M, DQ_M = rotor_constants(OM_MR, R_MR, C_MR, A_MR, CD0_MR)
+CT_T, DT_T, CQ_T, DQ_T = rotor_constants(OM_TR, R_TR, C_TR, A_TR, CD0_TR)
+
+# Discrete LQI: weights on the states and the integrals of u, v, w, psi; on the commands
+LQI_Q = np.diag([1, 1, 2, 0.05, 0.05, 0.05, 4, 4, 8, 0, 0, 0.3, 0.3, 0.5, 2.0])
+LQI_R = np.diag([2000.0, 4000, 4000, 400])
+INTEGRATED = (0, 1, 2, 8)  # u, v, w, psi
+ERROR_CLIP = (1.0, 1.0, 1.0, 0.5)  # m/s, m/s, m/s, rad: bounds the command while an actuator fights the loop
+INTEGRAL_CLIP = 1.0  # m, rad s: with 5 the recovery of a floating cyclic overturns the helicopter
+
+
+@kernel
+def thrust(slope, inflow, angle):
+    """T of T + inflow sqrt(T) = slope angle; zero below zero blade angle."""
+    lift = slope * max(angle, 0.0)
+    return lift + 0.5 * inflow * inflow - inflow * np.sqrt(lift + 0.25 * inflow * inflow)
+
+
+@kernel
+def dynamics(t, x, u, theta, d, p, dx):
+    """Rigid body, rotors, stabiliser bar and gust."""
+    roll_rate, pitch_rate, yaw_rate = x[3], x[4], x[5]
+    phi, pitch = x[6], x[7]
+    a1f, b1f = x[9], x[10]
+    col, lon = theta[0] * u[0] + theta[4], theta[1] * u[1] + theta[5]
+    lat, ped = theta[2] * u[2] + theta[6], theta[3] * u[3] + theta[7]
+    per_m, per_jxx, per_jyy, per_jzz, k_b, k_h = p[0], p[1], p[2], p[3], p[4], p[5]
+
+    tm = thrust(CT_M, DT_M, col)
+    qm = CQ_M * tm * np.sqrt(tm) + DQ_M
+    tt = thrust(CT_T, DT_T, ped + OFFSET_PED)
+    qt = CQ_T * tt * np.sqrt(tt) + DQ_T
+    a1, b1 = k_b * lon + K_F * a1f, k_b * lat + K_F * b1f
+    hub = tm * H_MR + K_BETA
+    sin_phi, cos_phi, sin_pitch, cos_pitch = np.sin(phi), np.cos(phi), np.sin(pitch), np.cos(pitch)
+    psi_rate = (pitch_rate * sin_phi + yaw_rate * cos_phi) / cos_pitch
+
+    dx[0] = -G * sin_pitch - tm * a1 * per_m + p[6] * d[0]
+    dx[1] = G * sin_phi * cos_pitch + (tm * b1 - tt) * per_m + p[7] * d[1]
+    dx[2] = G * cos_phi * cos_pitch - tm * per_m
+    dx[3] = (hub * b1 - H_TR * tt) * per_jxx + p[8] * d[1]
+    dx[4] = (hub * a1 - qt) * per_jyy
+    dx[5] = (D_TR * tt - qm) * per_jzz + p[9] * d[1]
+    dx[6] = roll_rate + sin_pitch * psi_rate
+    dx[7] = pitch_rate * cos_phi - yaw_rate * sin_phi
+    dx[8] = psi_rate
+    dx[9] = -pitch_rate + (k_h * lon - a1f) * PER_TAU_F
+    dx[10] = -roll_rate + (k_h * lat - b1f) * PER_TAU_F
+
+
+@kernel
+def output(t, x, u, theta, d, p, y):
+    """All states but the flapping are measured."""
+    for i in range(9):
+        y[i] = x[i]
+
+
+@kernel
+def control(t, y, r, q, c, u):
+    """LQI with clipped errors and an observer of the stabiliser bar. c = integrals (4), observed flapping (2).
+
+    q = the gain K (4, 15) row by row, trim command (4), trim of the outputs (9), trim flapping (2), K_H, decay of the
+    observer over a sample.
+    """
+    k_h, decay = q[75], q[76]
+    for i in range(4):
+        u[i] = q[60 + i]
+        for j in range(9):
+            e = y[j] - q[64 + j]
+            if j < 3:
+                e = min(max(e, -ERROR_CLIP[j]), ERROR_CLIP[j])
+            elif j == 8:
+                e = min(max(e, -ERROR_CLIP[3]), ERROR_CLIP[3])
+            u[i] -= q[15 * i + j] * e
+        for j in range(2):
+            u[i] -= q[15 * i + 9 + j] * (c[4 + j] - q[73 + j])
+        for j in range(4):
+            u[i] -= q[15 * i + 11 + j] * c[j]
+        u[i] = min(max(u[i], U_MIN[i]), U_MAX[i])
+    for j in range(4):
+        c[j] = min(max(c[j] + DT * y[INTEGRATED[j]], -INTEGRAL_CLIP), INTEGRAL_CLIP)
+    c[4] = decay * c[4] + (1.0 - decay) * TAU_F * (-y[4] + k_h / TAU_F * u[1])
+    c[5] = decay * c[5] + (1.0 - decay) * TAU_F * (-y[3] + k_h / TAU_F * u[2])
+
+
+@kernel
+def outside(t, x, r):
+    """Control is lost beyond 60 deg of roll or pitch, 20 m/s, 8 rad/s."""
+    lost = abs(x[6]) > np.pi / 3 or abs(x[7]) > np.pi / 3
+    for i in range(3):
+        lost = lost or abs(x[i]) > 20.0 or abs(x[3 + i]) > 8.0
+    return lost
+
+
+def _rate(x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """f(x, u), healthy and without gust."""
+    dx = np.empty(11)
+    dynamics(0.0, x, u, np.array([1.0] * 4 + [0.0] * 4), np.zeros(2), p, dx)
+    return dx
+
+
+def _physical(K_B: float, m: float = MASS, Jxx: float = JXX, Jyy: float = JYY, Jzz: float = JZZ) -> np.ndarray:
+    """p = 1/m, 1/Jxx, 1/Jyy, 1/Jzz, K_B, K_H and four zeros in place of the gust's entries."""
+    return np.array([1 / m, 1 / Jxx, 1 / Jyy, 1 / Jzz, K_B, (A_CYC - K_B) / K_F, 0.0, 0.0, 0.0, 0.0])
+
+
+def trim(K_B: float = 0.84) -> tuple[np.ndarray, np.ndarray]:
+    """Hover: state (11,) and command (4,), by Newton's method on the eight rates that are not kinematic."""
+    p = _physical(K_B)
+    free = [6, 7, 9, 10]  # phi, theta, a1f, b1f; then the four commands
+    rates = [0, 1, 2, 3, 4, 5, 9, 10]
+
+    def unpack(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x = np.zeros(11)
+        x[free] = z[:4]
+        return x, z[4:].copy()
+
+    z = np.array([0.08, 0, 0, 0, 0.096, 0, 0, -0.01])
+    for _ in range(8):
+        J = np.column_stack([
+            (_rate(*unpack(z + s), p) - _rate(*unpack(z - s), p))[rates] / 2e-6 for s in 1e-6 * np.eye(8)
+        ])  # fmt: skip
+        z = z - np.linalg.solve(J, _rate(*unpack(z), p)[rates])
+    return unpack(z)
+
+
+def linearised(x: np.ndarray, u: np.ndarray, K_B: float = 0.84) -> tuple[np.ndarray, np.ndarray]:
+    """Ad (11, 11) and Bd (11, 4): the Jacobians of one Runge-Kutta step at the equilibrium (x, u).
+
+    There every stage is the equilibrium itself, so the step's Jacobian is the Taylor polynomial of fourth order in the
+    continuous ones.
+    """
+    p = _physical(K_B)
+    A = np.column_stack([(_rate(x + s, u, p) - _rate(x - s, u, p)) / 2e-5 for s in 1e-5 * np.eye(11)])
+    B = np.column_stack([(_rate(x, u + s, p) - _rate(x, u - s, p)) / 2e-5 for s in 1e-5 * np.eye(4)])
+    hA = DT * A
+    series = np.eye(11) + hA / 2 @ (np.eye(11) + hA / 3 @ (np.eye(11) + hA / 4))
+    return np.eye(11) + hA @ series, DT * series @ B
+
+
+def lqi_gain(Ad: np.ndarray, Bd: np.ndarray) -> np.ndarray:
+    """K (4, 15) of the discrete LQ regulator for the states and the integrals of u, v, w, psi."""
+    A, B = np.eye(15), np.zeros((15, 4))
+    A[:11, :11], B[:11] = Ad, Bd
+    A[range(11, 15), INTEGRATED] = DT
+    S = scipy.linalg.solve_discrete_are(A, B, LQI_Q, LQI_R)
+    return np.linalg.solve(LQI_R + B.T @ S @ B, B.T @ S @ A)
+
+
+def gust_matrix(u: np.ndarray, kappa: float) -> np.ndarray:
+    """The entries (u, 0), (v, 1), (p, 1), (r, 1) of E_c (11, 2), from the rotors' thrust at the trim command u."""
+    lift = CT_M * u[0], CT_T * (u[3] + OFFSET_PED)
+    tm, tt = (v + d**2 / 2 - d * np.sqrt(v + d**2 / 4) for v, d in zip(lift, (DT_M, DT_T), strict=True))
+    inflow = np.sqrt(tm / (2 * RHO * np.pi * R_MR**2))  # m/s, main rotor
+    solidity = BLADES * C_TR / (np.pi * R_TR)
+    side = RHO * A_TR * solidity * OM_TR * R_TR * np.pi * R_TR**2 / 4 / (1 + DT_T / (2 * np.sqrt(tt)))  # N per m/s
+    return np.array([
+        0.5 * RHO * S_X * inflow / MASS, 0.5 * RHO * S_Y * inflow / MASS + kappa * side / MASS,
+        kappa * H_TR * side / JXX, -kappa * D_TR * side / JZZ,
+    ])  # fmt: skip
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Scenarios
+
+X_TRIM, U_TRIM = trim()
+MRAD = 1e-3
+
+# Ranges of the randomised process, per channel
+BIAS = ((1e-3, 12e-3), (0.4e-3, 6e-3), (0.3e-3, 6e-3), (2e-3, 15e-3))  # rad, log-uniform
+STUCK = (6e-3, 3e-3, 3e-3, 8e-3)  # rad, about trim
+SQUARE = ((2e-3, 12e-3), (1e-3, 6e-3), (1e-3, 6e-3), (3e-3, 12e-3))  # rad
+DRIFT = ((2e-3, 10e-3), (1e-3, 5e-3), (1e-3, 5e-3), (3e-3, 10e-3))  # rad, standard deviation
+LOSS = ((0.85, 0.98), (0.2, 0.7), (0.2, 0.7), (0.2, 0.7))  # gain that is left
+
+
+def bias(channel: str, value: float, onset: int, end: int | None = None) -> Fault:
+    """u_true = u_c + value [rad]."""
+    return Fault(channel, "bias", onset, [Abrupt(f"offset_{channel}", float(value))], end)
+
+
+def oscillating_bias(channel: str, value: float, period: float, onset: int, end: int | None = None) -> Fault:
+    """u_true = u_c + value in the even half periods [s] since the onset, u_c - value in the odd ones."""
+    wave = Square(f"offset_{channel}", float(value), -float(value), float(period))
+    return Fault(channel, "bias_square", onset, [wave], end)
+
+
+def stuck(channel: str, position: float | None, onset: int, end: int | None = None) -> Fault:
+    """u_true = position [rad]; None freezes the actuator where it was in the step before the onset."""
+    name = f"offset_{channel}"
+    place = Hold(name, channel, 1) if position is None else Abrupt(name, float(position))
+    kind = "stuck_hold" if position is None else "stuck_at"
+    return Fault(channel, kind, onset, [Abrupt(f"gain_{channel}", 0.0), place], end)
+
+
+def floating_square(channel: str, value: float, other: float, period: float, onset: int, end: int | None = None) -> Fault:
+    """u_true = value in the even half periods [s] since the onset, other in the odd ones, whatever is commanded."""
+    wave = Square(f"offset_{channel}", float(value), float(other), float(period))
+    return Fault(channel, "float_square", onset, [Abrupt(f"gain_{channel}", 0.0), wave], end)
+
+
+def floating(channel: str, positions: list[float], onset: int, end: int | None = None) -> Fault:
+    """u_true = positions[k - onset] [rad], whatever is commanded."""
+    drift = Samples(f"offset_{channel}", [float(v) for v in positions])
+    return Fault(channel, "float_free", onset, [Abrupt(f"gain_{channel}", 0.0), drift], end)
+
+
+def loss(channel: str, gain: float, onset: int, end: int | None = None) -> Fault:
+    """Loss of effectiveness: u_true = gain u_c."""
+    return Fault(channel, "loe", onset, [Abrupt(f"gain_{channel}", float(gain))], end)
+
+
+def gust(t0: float, rise: float, speed: float, hold: float | None = None) -> dict[str, float | None]:
+    """One gust: from t0 [s] up as 1 - cos in `rise` [s] to speed [m/s], `hold` [s] there (None: for good), and down."""
+    return {"t0": float(t0), "rise": float(rise), "speed": float(speed), "hold": None if hold is None else float(hold)}
+
+
+PAPER_GUSTS = {"u_g": gust(2.0, 2.0, 4.0), "v_g": gust(5.0, 2.0, 3.0)}
+
+
+def disturbance_rows(scenario: FaultScenario) -> np.ndarray:
+    """d (steps + 1, 2): the gust at the samples.
+
+    Raises:
+        ValueError: The scenario names a gust component that does not exist.
+    """
+    d = np.zeros((scenario.steps + 1, 2))
+    t = np.arange(scenario.steps + 1) * DT
+    for name, g in scenario.disturbance.items():
+        if name not in ("u_g", "v_g"):
+            raise ValueError(f"unknown disturbance {name!r}; {ID} has u_g, v_g")
+        rise, speed = g["rise"], g["speed"]
+        s = t - g["t0"]
+        fall = np.full_like(s, -1.0) if g["hold"] is None else s - rise - g["hold"]
+        up = speed / 2 * (1 - np.cos(np.pi * np.clip(s / rise, 0, 1)))
+        down = np.where(fall < rise, speed / 2 * (1 + np.cos(np.pi * np.clip(fall / rise, 0, 1))), 0.0)
+        d[:, ("u_g", "v_g").index(name)] = np.where(fall > 0, down, up)
+    return d
+
+
+def paper(number: int = 1) -> FaultScenario:
+    """Scenario 1 to 4 of the source: sequential biases; floating, then stuck; simultaneous; 4 is 1."""
+    faults = {
+        1: [oscillating_bias("lat", -0.01, 1.0, 200, 400), bias("lon", 0.005, 400, 500), bias("ped", -0.01, 500, 700)],
+        2: [floating_square("lat", 0.01, -0.01, 1.0, 200, 400), stuck("lon", float(U_TRIM[1]), 700, 900)],
+        3: [floating_square("lat", 0.01, -0.01, 1.0, 400, 700), bias("ped", -0.01, 400, 700)],
+    }
+    chosen = faults[1 if number == 4 else number]
+    return FaultScenario(plant=ID, steps=STEPS, faults=chosen, disturbance=PAPER_GUSTS)
+
+
+def sample(rng: np.random.Generator) -> FaultScenario:
+    """A flight of the randomised process. The order of draws is part of the benchmark; magnitudes in rad."""
+    count = int(rng.choice(3, p=[0.15, 0.65, 0.20]))
+    faults = []
+    for c in rng.permutation(4)[:count]:
+        channel, centre = CHANNELS[c], float(U_TRIM[c])
+        kind = int(rng.choice(4, p=[0.4, 0.2, 0.2, 0.2]))
+        k0 = round(rng.uniform(3, 12) / DT)
+        duration = rng.uniform(2, 6)
+        k1 = STEPS if rng.random() < 0.3 else min(STEPS, k0 + round(duration / DT))
+        if kind == 0:
+            sign = float(rng.choice([-1, 1]))
+            faults.append(bias(channel, sign * np.exp(rng.uniform(*np.log(BIAS[c]))), k0, k1))
+        elif kind == 1:
+            position = None if rng.random() < 0.5 else centre + rng.uniform(-1, 1) * STUCK[c]
+            faults.append(stuck(channel, position, k0, k1))
+        elif kind == 2 and rng.random() < 0.5:
+            amplitude, period = rng.uniform(*SQUARE[c]), rng.uniform(0.6, 2)
+            amplitude = float(rng.choice([-1, 1])) * amplitude
+            faults.append(floating_square(channel, centre + amplitude, centre - amplitude, period, k0, k1))
+        elif kind == 2:
+            sigma = rng.uniform(*DRIFT[c])
+            s, a = sigma * rng.standard_normal(), np.exp(-DT / 0.5)
+            positions = []
+            for e in rng.standard_normal(k1 - k0):
+                positions.append(centre + s)
+                s = a * s + sigma * np.sqrt(1 - a**2) * e
+            faults.append(floating(channel, positions, k0, k1))
+        else:
+            faults.append(loss(channel, rng.uniform(*LOSS[c]), k0, k1))
+    gusts = {}
+    for name in ("u_g", "v_g"):
+        if rng.random() < 0.7:
+            t0, rise, hold, speed = rng.uniform(1, 14), rng.uniform(1, 3), rng.uniform(0, 5), rng.uniform(-4, 4)
+            gusts[name] = gust(t0, rise, speed, hold)
+    return FaultScenario(plant=ID, steps=STEPS, faults=faults, disturbance=gusts)
+
+
+def episode(seed: int) -> FaultScenario:
+    """Flight `seed` of the benchmark's own numbering: scenario from default_rng([seed, 1]), noise seed + 1,000,000."""
+    return sample(np.random.default_rng([seed, 1])).replace(noise_seed=seed + 1_000_000)
+
+
+def fault_free_episode(seed: int) -> FaultScenario:
+    """The same flight without its faults, gusts kept."""
+    return episode(seed).without_faults()
+
+
+def perturb(rng: np.random.Generator, level: float) -> dict[str, float]:
+    """Mass and inertias times 1 + level U(-1, 1) each."""
+    nominal = {"m": MASS, "Jxx": JXX, "Jyy": JYY, "Jzz": JZZ}
+    return {name: float(value * (1 + level * rng.uniform(-1, 1))) for name, value in nominal.items()}
+
+
+def _processes() -> dict[str, FaultProcess]:
+    scoring = Scoring(decision="second_half")
+    found = [
+        FaultProcess(name="standard", description="0, 1 or 2 actuator faults under random gusts", sample=sample,
+                     scoring=scoring),
+        FaultProcess(name="hard", description="the same, side gusts with the full weathercock coupling (kappa = 1)",
+                     sample=lambda rng: sample(rng).replace(physical={"kappa": 1.0}), scoring=scoring),
+        FaultProcess(name="fault-free", description="the standard flights without their faults",
+                     sample=lambda rng: sample(rng).without_faults(), scoring=scoring),
+        FaultProcess(name="paper", description="the source's scenario 1: biases on lat, lon and ped in turn",
+                     sample=lambda rng: paper(1), scoring=scoring),
+    ]  # fmt: skip
+    words = ("biases on lat, lon and ped in turn", "lat floats, then lon is stuck", "lat floats while ped is biased",
+             "scenario 1, for all filters side by side")  # fmt: skip
+    for number, description in enumerate(words, start=1):
+        found.append(FaultProcess(name=f"scenario-{number}", description=description, scoring=scoring,
+                                  sample=lambda rng, number=number: paper(number)))  # fmt: skip
+    return {process.name: process for process in found}
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Declaration
+
+
+ACTIVITY = (0.0017, 0.0015, 0.0015, 0.0046)  # rad rms: the command about trim in the fault-free flights
+BANDS = ((3e-3, 6e-3), (1e-3, 3e-3), (1e-3, 3e-3), (4e-3, 8e-3))  # rad: small, medium, large
+
+
+def _size(theta: np.ndarray, c: int) -> np.ndarray:
+    """Typical |b| [rad] under a fault: the error at trim, and with it the command's activity that a gain loses."""
+    lost = 1 - theta[..., c]
+    return np.hypot(theta[..., 4 + c] - lost * U_TRIM[c], lost * ACTIVITY[c])
+
+
+def target(theta: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """The actuator error b = u_true - u_c (..., 4) under theta (..., 8) and the command u (..., 4)."""
+    return (theta[..., :4] - 1.0) * u + theta[..., 4:]
+
+
+def prescribed_noise(rng: np.random.Generator, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Process noise w (steps, 11), then sensor noise v (steps + 1, 9): the benchmark's order of draws."""
+    w = rng.standard_normal((steps, 11)) * SIGMA_W
+    return w, rng.standard_normal((steps + 1, 9)) * SIGMA_V
+
+
+def _labels() -> tuple[Label, ...]:
+    pairs = [(a, b) for i, a in enumerate(CHANNELS) for b in CHANNELS[i + 1 :]]
+    return (
+        Label("none", frozenset()),
+        *(Label(c, frozenset({c})) for c in CHANNELS),
+        *(Label(f"{a}+{b}", frozenset({a, b})) for a, b in pairs),
+    )
+
+
+def identification_reward(error: np.ndarray) -> np.ndarray:
+    """Minus the mean over the channels of min(|error| / scale, 5)."""
+    return -np.minimum(np.abs(error) / B_SCALE, 5.0).mean(axis=-1)
+
+
+def plant(*, kappa: float = 0.3, K_B: float = 0.84) -> Plant:
+    """Build the plant.
+
+    Args:
+        kappa: Share of the tail rotor's weathercock coupling in the side gust: 0 easy, 0.3 default, 1 hard (physical).
+        K_B: Direct (Bell) gain from swash plate to tip-path plane; the stabiliser bar has the rest of 4.2. The robust
+            filters live on it: they see a cyclic fault in the first sample only through this path.
+
+    Raises:
+        ValueError: kappa outside 0 to 1.
+    """
+    if not 0.0 <= kappa <= 1.0:
+        raise ValueError(f"kappa lies between 0 and 1, not {kappa}")
+    x_trim, u_trim = trim(K_B)
+    K = lqi_gain(*linearised(x_trim, u_trim, K_B))
+    p = _physical(K_B)
+
+    def physical(changes: Mapping[str, Any]) -> np.ndarray:
+        known = {"m", "Jxx", "Jyy", "Jzz"}
+        if unknown := set(changes) - known - {"kappa"}:
+            raise ValueError(f"unknown physical parameter {sorted(unknown)}; {ID} has {sorted(known | {'kappa'})}")
+        changed = _physical(K_B, **{name: float(value) for name, value in changes.items() if name in known})
+        changed[6:] = gust_matrix(u_trim, changes.get("kappa", kappa))
+        return changed
+
+    labels = _labels()
+    accused = np.array([[c in label.modes for c in CHANNELS] for label in labels])
+    wrongly = (accused[None] & ~accused[:, None]).sum(axis=2)
+    inf, lim = np.inf, (20.0, 20.0, 20.0, 8.0, 8.0, 8.0, np.pi / 3, np.pi / 3, np.inf, np.inf, np.inf)
+    units = ("m/s",) * 3 + ("rad/s",) * 3 + ("rad",) * 5
+    scales = (0.5,) * 3 + (0.2,) * 3 + (0.1,) * 3 + (0.01,) * 2
+    unit4 = np.eye(4)
+    return Plant(
+        id=ID, version=VERSION, options={"kappa": float(kappa), "K_B": float(K_B)},
+        description="helicopter UAV in hover: actuator faults under wind gusts",
+        dt=DT, substeps=1,
+        kernels=Kernels(dynamics, output, control, outside=outside),
+        states=tuple(Signal(n, unit, -high, high, scale, w, float(x)) for n, unit, high, scale, w, x in zip(
+            STATES, units, lim, scales, SIGMA_W, x_trim, strict=True)),
+        outputs=tuple(Signal(n, unit, -inf, inf, scale, v, float(x)) for n, unit, scale, v, x in zip(
+            STATES[:9], units[:9], scales[:9], SIGMA_V, x_trim[:9], strict=True)),
+        commands=tuple(Signal(c, "rad", low, high, scale, 0.0, float(u)) for c, low, high, scale, u in zip(
+            CHANNELS, U_MIN, U_MAX, (0.01, 0.01, 0.01, 0.02), u_trim, strict=True)),
+        theta=(
+            *(Signal(f"gain_{c}", "", 0.0, 1.0, 1.0, 0.0, 1.0) for c in CHANNELS),
+            *(Signal(f"offset_{c}", "rad", -b, b, s) for c, b, s in zip(CHANNELS, B_MAX, B_SCALE, strict=True)),
+        ),
+        estimated=tuple(Signal(c, "rad", -b, b, s) for c, b, s in zip(CHANNELS, B_MAX, B_SCALE, strict=True)),
+        target=target,
+        disturbances=(Signal("u_g", "m/s", -inf, inf, 2.0), Signal("v_g", "m/s", -inf, inf, 2.0)),
+        disturbance=disturbance_rows,
+        modes=tuple(FaultMode(
+            c, f"the {c} actuator is not where it is commanded: b_{c} = u_true - u_c", lambda th, i=i: _size(th, i),
+            BANDS[i], offset=(0.0,) * 4, direction=tuple(unit4[i].tolist()), reach=(-B_MAX[i], B_MAX[i]),
+        ) for i, c in enumerate(CHANNELS)),
+        labels=labels, processes=_processes(),
+        c0=np.concatenate([np.zeros(4), x_trim[9:]]),
+        q=np.concatenate([K.ravel(), u_trim, x_trim, [p[5], np.exp(-DT / TAU_F)]]),
+        physical=physical, perturb=perturb,
+        noise=prescribed_noise, isolation_reward=np.eye(len(labels)) - 0.5 * wrongly,
+        identification_reward=identification_reward,
+    )  # fmt: skip

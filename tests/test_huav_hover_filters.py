@@ -1,0 +1,609 @@
+"""The three-stage filters, the hypothesis bank and the oracle on the hovering helicopter."""
+
+import itertools
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from baselines.filters.flag_thresholds import TABLE, calibrate
+from baselines.filters.hypothesis_bank import transitions
+from baselines.filters.matched_oracle import steady_filter
+from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, guarded, make_diagnoser, run
+from fdi_gym.estimation import flags, robust_three_stage, three_stage
+from fdi_gym.estimation.propagation import (
+    Propagated,
+    central_difference_rule,
+    extended_rule,
+    fault_inputs,
+    linear_output,
+    trim_model,
+)
+from fdi_gym.faults import FaultProcess, FaultScenario
+from fdi_gym.kernels import kernel
+from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal, load_plant
+from fdi_gym.plants import b747_lateral, huav_hover
+from fdi_gym.simulation import no_noise, simulate
+from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env
+
+P3, P4 = ("lon", "lat", "ped"), huav_hover.CHANNELS
+FILTERS = ("ascdkf", "three_stage_cdkf", "three_stage_ekf", "robust_three_stage_cdkf", "robust_three_stage_ekf")
+ALL = (*FILTERS, "hypothesis_bank", "matched_oracle")
+MRAD = 1e-3
+
+
+@pytest.fixture(scope="module")
+def plant():
+    return load_plant(huav_hover.ID)
+
+
+def build(name, plant, **tuning):
+    entry = find_diagnoser(name)
+    return entry.build(plant, **{**entry.settings, **tuning})
+
+
+def last_state(diagnoser, obs):
+    """The diagnoser's state after the observations (n, samples, n_obs), and what it says last."""
+    state, said = diagnoser.init(len(obs)), None
+    for k in range(obs.shape[1]):
+        state, said = diagnoser.update(state, obs[:, k])
+    return state, said
+
+
+# -- a linear plant of any size, for the identities
+
+
+@kernel
+def linear_dynamics(t, x, u, theta, d, p, dx):
+    """A x + Bu u + Bf theta + E d, the matrices row by row in p."""
+    n, m, q, r = x.size, u.size, theta.size, d.size
+    for i in range(n):
+        dx[i] = 0.0
+        for j in range(n):
+            dx[i] += p[i * n + j] * x[j]
+        for j in range(m):
+            dx[i] += p[n * n + i * m + j] * u[j]
+        for j in range(q):
+            dx[i] += p[n * (n + m) + i * q + j] * theta[j]
+        for j in range(r):
+            dx[i] += p[n * (n + m + q) + i * r + j] * d[j]
+
+
+@kernel
+def linear_output_map(t, x, u, theta, d, p, y):
+    """H x, H after the other matrices in p."""
+    n, start = x.size, x.size * (x.size + u.size + theta.size + d.size)
+    for i in range(y.size):
+        y[i] = 0.0
+        for j in range(n):
+            y[i] += p[start + i * n + j] * x[j]
+
+
+@kernel
+def no_control(t, y, r, q, c, u):
+    """The loop is open and nothing is commanded."""
+    for i in range(u.size):
+        u[i] = 0.0
+
+
+def linear_plant(A, Bu, Bf, E, H, sigma_w, sigma_v, dt=0.02):
+    """A discrete linear plant with an additive fault theta and a disturbance given as rows in the scenario."""
+    inf = np.inf
+    names = [f"b{i}" for i in range(Bf.shape[1])]
+    eye = np.eye(len(names))
+    return Plant(
+        id="Linear", version=0, description="linear", dt=dt, substeps=0, linear=True,
+        kernels=Kernels(linear_dynamics, linear_output_map, no_control),
+        states=tuple(Signal(f"x{i}", "", -inf, inf, 1.0, s) for i, s in enumerate(sigma_w)),
+        outputs=tuple(Signal(f"y{i}", "", -inf, inf, 1.0, s) for i, s in enumerate(sigma_v)),
+        commands=tuple(Signal(f"u{i}", "", -1.0, 1.0) for i in range(Bu.shape[1])),
+        theta=tuple(Signal(n, "", -inf, inf) for n in names),
+        disturbances=tuple(Signal(f"d{i}", "", -inf, inf) for i in range(E.shape[1])),
+        disturbance=lambda s: np.array(s.disturbance["rows"], float),
+        modes=tuple(FaultMode(n, "", lambda th, i=i: np.abs(th[..., i]), (1.0, 2.0), (0.0,) * len(names),
+                              tuple(eye[i]), (-1.0, 1.0)) for i, n in enumerate(names)),
+        labels=(Label("none", frozenset()), *(Label(n, frozenset({n})) for n in names)),
+        processes={"standard": FaultProcess(name="standard", description="", sample=lambda g: FaultScenario(
+            plant="Linear", steps=10, disturbance={"rows": [[0.0] * E.shape[1]] * 11}))},
+        physical=lambda changes: np.concatenate([M.ravel() for M in (A, Bu, Bf, E, H)]),
+    )  # fmt: skip
+
+
+def linearised_helicopter(kappa=0.3, channels=P4):
+    plant = load_plant(huav_hover.ID, kappa=kappa)
+    at, H = trim_model(plant, fault_inputs(plant, channels)), linear_output(plant)
+    return linear_plant(at.A, np.zeros((11, 4)), at.B, at.E, H, huav_hover.SIGMA_W, huav_hover.SIGMA_V)
+
+
+def rows_flown(model, b, d, w, v):
+    """Measurements (samples, n_y) and states of a linear plant under given inputs, by hand."""
+    at, H = trim_model(model, fault_inputs(model)), linear_output(model)
+    x = np.zeros((len(b) + 1, len(at.A)))
+    for k in range(len(b)):
+        x[k + 1] = at.A @ x[k] + at.B @ b[k] + at.E @ d[k] + w[k]
+    return x @ H.T + v, x
+
+
+def shown(model, y):
+    """The same as observations (1, samples, n_obs)."""
+    return np.hstack([y, np.zeros((len(y), len(model.commands)))])[None]
+
+
+# -- check values
+
+
+@pytest.mark.parametrize(("name", "b", "d"), [
+    ("ascdkf", (0.004996343541, -5.29515e-08, -0.001562037280), (3.470429326, 2.644355883)),
+    ("three_stage_cdkf", (0.004996324913, -5.29244e-08, -0.001559098950), (3.470405888, 2.644356209)),
+    ("three_stage_ekf", (0.004996324700, -5.29278e-08, -0.001559190129), (3.470412741, 2.644335441)),
+    ("robust_three_stage_cdkf", (0.004999997188, 9.7417e-11, -8.19455e-07), (3.999689426, 2.999812699)),
+    ("robust_three_stage_ekf", (0.004999997099, 9.9463e-11, -8.55970e-07), (3.999701374, 2.999804348)),
+])  # fmt: skip
+def test_filter_rows_on_the_noise_free_flight(plant, name, b, d):
+    obs = simulate(plant, [huav_hover.paper(1)], [no_noise(plant, huav_hover.STEPS)]).obs[:, :451]
+    (_, s, _), said = last_state(build(name, plant, channels=P3), obs)
+    exact = not name.endswith("ekf")  # the EKF rows depend on the Jacobian at the 1e-9 level
+    assert said.theta[0, 1:] == pytest.approx(b, abs=1e-12 if exact else 1e-8)
+    assert said.theta[0, 0] == 0
+    disturbance = s.x[0, 14:] if name == "ascdkf" else s.d[0]
+    assert disturbance == pytest.approx(d, abs=1e-9 if exact else 1e-4 if "robust" in name else 1e-6)
+
+
+def test_hypothesis_bank_check_values(plant):
+    obs = simulate(plant, [huav_hover.episode(1)]).obs
+    diagnoser = build("hypothesis_bank", plant)
+    state, seen = diagnoser.init(1), {}
+    for k in range(522):
+        state, said = diagnoser.update(state, obs[:, k])
+        seen[k - 1] = said.mode_probs[0, 0], said.mode_probs[0, 2], said.theta[0, 1] / MRAD
+    assert seen[512][:2] == pytest.approx((0.966584, 0.003300), rel=2e-4)
+    assert seen[513] == pytest.approx((0.002053, 0.978335, 3.66412), rel=2.5e-4)
+    assert seen[520][1:] == pytest.approx((0.987608, 5.39050), rel=1e-4)
+
+
+@pytest.mark.parametrize(("kappa", "channels", "condition", "radius", "std_b", "std_d"), [
+    (0.0, P3, 1.15, 0.974864, (2.18, 1.16, 2.73), (113.8, 51.7)),
+    (0.0, P4, 2.62, 0.974866, (25.91, 2.18, 1.34, 24.64), (113.8, 51.8)),
+    (0.3, P3, 21.1, 0.974864, (3.27, 1.16, 230.17), (113.8, 51.7)),
+    (0.3, P4, 24.3, 0.974866, (25.91, 3.28, 1.34, 232.36), (113.8, 51.8)),
+    (1.0, P3, 70.0, 0.974864, (8.43, 1.16, 767.15), (113.9, 51.7)),
+    (1.0, P4, 80.5, 0.974866, (25.91, 8.44, 1.34, 768.71), (113.9, 51.8)),
+])  # fmt: skip
+def test_existence_conditions(kappa, channels, condition, radius, std_b, std_d):
+    plant = load_plant(huav_hover.ID, kappa=kappa)
+    found = robust_three_stage.existence(plant, fault_inputs(plant, channels), linear_output(plant))
+    assert found.rank == found.needed == len(channels) + 2
+    assert found.condition == pytest.approx(condition, rel=5e-3)
+    assert found.radius == pytest.approx(radius, abs=1e-6)
+    assert found.std_b / MRAD == pytest.approx(std_b, abs=0.0051)
+    assert found.std_d == pytest.approx(std_d, abs=0.051)
+
+
+@pytest.mark.parametrize(("K_B", "std"), [(0.2, (7.0, 3.7)), (0.42, (4.0, 2.1)), (0.84, (2.2, 1.2)), (1.68, (1.2, 0.6))])
+def test_robust_cyclic_accuracy_lives_on_the_direct_gain(K_B, std):
+    plant = load_plant(huav_hover.ID, kappa=0.0, K_B=K_B)
+    found = robust_three_stage.existence(plant, fault_inputs(plant, P3), linear_output(plant))
+    assert found.std_b[:2] / MRAD == pytest.approx(std, abs=0.051)
+    assert found.std_b[2] / MRAD == pytest.approx(2.7, abs=0.051)
+
+
+def signatures(A, G, H, Q, R, steps):
+    """Whitened innovations (steps, n_y, inputs) of a steady Kalman filter under unit steps of the inputs G."""
+    P = scipy.linalg.solve_discrete_are(A.T, H.T, Q, R)
+    C = H @ P @ H.T + R
+    still, white = np.eye(len(A)) - P @ H.T @ np.linalg.solve(C, H), np.linalg.inv(np.linalg.cholesky(C))
+    error, rows = np.zeros_like(G), []
+    for _ in range(steps):
+        ahead = A @ error + G
+        rows.append(white @ H @ ahead)
+        error = still @ ahead
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(("kappa", "col_v", "ped_v", "norm_v"), [
+    (0.0, 0.000, -0.0345, 1.86), (0.3, 0.730, -0.9957, 20.02), (1.0, 0.734, -0.9996, 66.31),
+])  # fmt: skip
+def test_side_gust_looks_like_a_pedal_fault(kappa, col_v, ped_v, norm_v):
+    plant = load_plant(huav_hover.ID, kappa=kappa)
+    at, H = trim_model(plant, fault_inputs(plant)), linear_output(plant)
+    rows = signatures(at.A, np.hstack([at.B, at.E]), H, plant.Q, plant.R, 50).reshape(-1, 6)
+    norm = np.linalg.norm(rows, axis=0)
+    cosine = (rows / norm).T @ (rows / norm)
+    assert norm * [MRAD, MRAD, MRAD, MRAD, 1, 1] == pytest.approx([5.73, 14.53, 18.23, 4.47, 0.84, norm_v], abs=0.0151)
+    assert cosine[0, 3] == pytest.approx(-0.735, abs=5.1e-4)
+    assert cosine[0, 5] == pytest.approx(col_v, abs=5.1e-4)
+    assert cosine[3, 5] == pytest.approx(ped_v, abs=5.1e-5)
+
+
+@pytest.mark.parametrize(("kappa", "alone", "joint"), [
+    (0.0, (0.275, 0.103, 0.080, 0.321), (0.465, 0.103, 0.080, 0.545)),
+    (0.3, (0.414, 0.103, 0.080, 0.868), (0.465, 0.103, 0.080, 0.975)),
+    (1.0, (0.450, 0.103, 0.080, 1.745), (0.465, 0.103, 0.080, 1.803)),
+])  # fmt: skip
+def test_bound_on_a_bias_half_a_second_after_its_onset(kappa, alone, joint):
+    plant = load_plant(huav_hover.ID, kappa=kappa)
+    model = steady_filter(plant, fault_inputs(plant), 0.05)
+    Q = scipy.linalg.block_diag(plant.Q, 0.05**2 * np.eye(2))
+    rows = signatures(model.A, model.Bf, model.H, Q, plant.R, 25).reshape(-1, 4)
+    G = rows.T @ rows
+    assert 1 / np.sqrt(np.diag(G)) / MRAD == pytest.approx(alone, abs=5.1e-4)
+    assert np.sqrt(np.diag(np.linalg.inv(G))) / MRAD == pytest.approx(joint, abs=5.1e-4)
+
+
+# -- existence conditions that fail
+
+
+def test_unstable_invariant_zero_is_refused_at_construction():
+    # (z - zero) / ((z - 0.5) (z - 0.6)) from the fault to the one sensor
+    def model(zero):
+        A, B, H = np.array([[1.1, -0.3], [1.0, 0.0]]), np.array([[1.0], [0.0]]), np.array([[1.0, -zero]])
+        return linear_plant(A, np.zeros((2, 1)), B, np.zeros((2, 0)), H, [0.1] * 2, [0.1])
+
+    tuning = {"x0_std": [1.0] * 2, "thresholds": [1.0]}
+    with pytest.raises(NotApplicableError, match=r"largest modulus .* is 1\.5: an unstable invariant zero"):
+        build("robust_three_stage_cdkf", model(1.5), **tuning)
+    build("robust_three_stage_cdkf", model(0.9), **tuning)
+
+
+def test_too_many_unknown_inputs_are_refused_at_construction():
+    # a vertical gust beside four faults and the horizontal gusts: seven inputs, six velocity-type outputs
+    plant = load_plant(huav_hover.ID, kappa=0.0)
+    at, H = trim_model(plant, fault_inputs(plant)), linear_output(plant)
+    E = np.column_stack([at.E, 0.02 * 0.05 * np.eye(11)[2]])
+    model = linear_plant(at.A, np.zeros((11, 4)), at.B, E, H, huav_hover.SIGMA_W, huav_hover.SIGMA_V)
+    with pytest.raises(NotApplicableError, match="rank"):
+        build("robust_three_stage_ekf", model, thresholds=[1.0] * 4)
+
+
+def test_an_input_that_no_sensor_sees_is_refused_at_construction():
+    E = np.zeros((3, 1))
+    model = linear_plant(0.9 * np.eye(3), np.zeros((3, 1)), np.eye(3)[:, :1], E, np.eye(3), [0.1] * 3, [0.1] * 3)
+    with pytest.raises(NotApplicableError, match="rank"):
+        build("robust_three_stage_cdkf", model, thresholds=[1.0], x0_std=[1.0] * 3)
+
+
+def test_errors_name_what_is_allowed(plant):
+    with pytest.raises(NotApplicableError, match="col, lon, lat, ped"):
+        build("three_stage_cdkf", plant, channels=("rudder",))
+    with pytest.raises(NotApplicableError, match="no calibrated thresholds"):
+        build("three_stage_cdkf", load_plant(huav_hover.ID, kappa=0.5))
+    with pytest.raises(NotApplicableError, match="no calibrated thresholds"):
+        build("three_stage_cdkf", load_plant(huav_hover.ID, K_B=0.5))
+    with pytest.raises(NotApplicableError, match="x0_std"):
+        build("ascdkf", plant, x0_std=[1.0])
+    with pytest.raises(ValueError, match="unknown rule"):
+        build("three_stage_cdkf", plant, rule="unscented")
+    with pytest.raises(NotApplicableError, match="errors of commands"):
+        make_diagnoser("matched_oracle", load_plant(b747_lateral.ID), scenarios=[b747_lateral.paper()])
+
+
+# -- identities
+
+
+def textbook(x, P, y, A, H, Q, R):
+    """A Kalman filter step as in any textbook."""
+    x, P = A @ x, A @ P @ A.T + Q
+    C = H @ P @ H.T + R
+    K = P @ H.T @ np.linalg.inv(C)
+    P = P - K @ C @ K.T
+    return x + K @ (y - H @ x), (P + P.T) / 2
+
+
+def test_three_stage_algebra_is_the_augmented_kalman_filter():
+    """Random systems with feed-through and a full noise covariance of [x; b; d]."""
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        n, p, q, m = 5, 2, 2, 6
+        N = n + p + q
+        A = 0.4 * rng.standard_normal((n, n))
+        B, E = rng.standard_normal((n, p)), rng.standard_normal((n, q))
+        H, By, Ey = rng.standard_normal((m, n)), rng.standard_normal((m, p)), rng.standard_normal((m, q))
+        root = 0.3 * rng.standard_normal((N, N))
+        Qa, R = root @ root.T + 0.1 * np.eye(N), np.diag(rng.uniform(0.1, 1, m))
+        Aa, Ha = np.eye(N), np.hstack([H, By, Ey])
+        Aa[:n] = np.hstack([A, B, E])
+        x, P = np.zeros(N), np.diag(rng.uniform(0.5, 2, N))
+        s = three_stage.start(1, x[:n], P[:n, :n], P[n : n + p, n : n + p], P[n + p :, n + p :])
+        for _ in range(100):
+            y = 3 * rng.standard_normal(m)
+            xhat, bhat, dhat = s.estimates()
+            f = Propagated(xhat @ A.T + bhat @ B.T + dhat @ E.T, (A @ s.Px[0] @ A.T)[None], A[None], None, B[None], E[None])
+            s = three_stage.step(
+                s, f, y[None], H, Qa[:n, :n], R, Qa[n : n + p, n : n + p], Qa[n + p :, n + p :], By=By, Ey=Ey,
+                Qxb=Qa[:n, n : n + p], Qxd=Qa[:n, n + p :], Qbd=Qa[n : n + p, n + p :],
+            )  # fmt: skip
+            x, P = textbook(x, P, y, Aa, Ha, Qa, R)
+        assert np.concatenate(s.estimates(), axis=1)[0] == pytest.approx(x, rel=1e-9, abs=1e-9)
+        assert s.covariance()[0] == pytest.approx(P, rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["three_stage_cdkf", "three_stage_ekf"])
+def test_three_stage_filter_is_the_augmented_one_on_the_linearised_helicopter(name):
+    model = linearised_helicopter()
+    rng = np.random.default_rng(2)
+    k = np.arange(500)[:, None]
+    b = 1e-4 * np.where(k > 100, [2, -1, 1, 2], 0) * np.sign(np.sin(k / 20 + np.arange(4)))  # the loop is open
+    w, v = rng.standard_normal((500, 11)) * huav_hover.SIGMA_W, rng.standard_normal((501, 9)) * huav_hover.SIGMA_V
+    y, _ = rows_flown(model, b, np.where(k > 50, [0.04, 0.03], 0), w, v)
+    (_, s, _), _ = last_state(build(name, model, thresholds=[1.0] * 4), shown(model, y))
+    (_, a, _), _ = last_state(build("ascdkf", model, thresholds=[1.0] * 4), shown(model, y))
+    scale = np.sqrt(np.diagonal(a.P[0]))
+    assert np.concatenate(s.estimates(), axis=1)[0] / scale == pytest.approx(a.x[0] / scale, rel=1e-9, abs=1e-9)
+    assert s.covariance()[0] / np.outer(scale, scale) == pytest.approx(a.P[0] / np.outer(scale, scale), abs=1e-9)
+
+
+def test_rules_agree_with_the_matrices_of_a_linear_plant():
+    model = linearised_helicopter()
+    inputs = fault_inputs(model)
+    rng = np.random.default_rng(3)
+    root = rng.standard_normal((2, 11, 11))
+    P, x = root @ np.swapaxes(root, 1, 2), rng.standard_normal((2, 11))
+    b, d, u = rng.standard_normal((2, 4)), rng.standard_normal((2, 2)), np.zeros((2, 4))
+    p, at = model.nominal_p, (0, 121, 165, 209, 231)  # A, Bu, Bf, E, one after the other
+    A, _, B, E = (p[i:j].reshape(11, -1) for i, j in itertools.pairwise(at))
+    for rule in (central_difference_rule(model, inputs), extended_rule(model, inputs)):
+        f = rule(0.0, x, P, u, b, d)
+        for i in range(2):
+            assert f.x[i] == pytest.approx(A @ x[i] + B @ b[i] + E @ d[i], abs=1e-9)
+            assert f.P[i] == pytest.approx(A @ P[i] @ A.T, rel=1e-7, abs=1e-7)
+            assert f.A[i] == pytest.approx(A, abs=1e-7)
+            assert f.carry(np.eye(11)[None])[i] == pytest.approx(A, abs=1e-7)
+            assert f.B[i] == pytest.approx(B, abs=1e-7)
+            assert f.E[i] == pytest.approx(E, abs=1e-9)
+
+
+def test_robust_filter_is_the_joint_unbiased_minimum_variance_filter():
+    plant = load_plant(huav_hover.ID)
+    inputs, H = fault_inputs(plant, P3), linear_output(plant)
+    at = trim_model(plant, inputs)
+    rng = np.random.default_rng(4)
+    P, x = np.eye(11), np.zeros(11)
+    for _ in range(200):
+        y = rng.standard_normal(9) * huav_hover.SIGMA_V
+        f = Propagated((at.A @ x)[None], (at.A @ P @ at.A.T)[None], at.A[None], None, at.B[None], at.E[None])
+        L, P_joint = robust_three_stage.input_gain(f, H, plant.Q, plant.R)
+        s = robust_three_stage.step(f, y[None], H, plant.Q, plant.R)
+        joint = f.x[0] + L[0] @ (y - H @ f.x[0])
+        std = np.sqrt(np.diagonal(s.P[0]))
+        assert (s.x[0] - joint) / std == pytest.approx(np.zeros(11), abs=1e-7)
+        assert s.P[0] / np.outer(std, std) == pytest.approx(P_joint[0] / np.outer(std, std), abs=1e-9)
+        x, P = s.x[0], s.P[0]
+
+
+def test_robust_filter_is_the_limit_of_the_optimal_one():
+    model = linearised_helicopter(channels=P3)
+    rng = np.random.default_rng(5)
+    w, v = rng.standard_normal((200, 11)) * huav_hover.SIGMA_W, rng.standard_normal((201, 9)) * huav_hover.SIGMA_V
+    y, _ = rows_flown(model, 0.01 * np.ones((200, 3)), np.ones((200, 2)), w, v)
+    wide = {"b_step": 10.0, "d_step": 1e4, "b0_std": 10.0, "d0_std": 1e4, "thresholds": [1.0] * 3}
+    (_, s, _), _ = last_state(build("three_stage_ekf", model, **wide), shown(model, y))
+    (_, r, _), _ = last_state(build("robust_three_stage_ekf", model, thresholds=[1.0] * 3), shown(model, y))
+    xhat, bhat, dhat = s.estimates()
+    for optimal, robust, cov in ((xhat, r.x, r.P), (bhat, r.b, r.cov_b), (dhat, r.d, r.cov_d)):
+        assert np.abs(optimal - robust)[0] / np.sqrt(np.diagonal(cov[0])) == pytest.approx(0, abs=2e-2)
+
+
+def arbitrary_signals(steps):
+    """Square waves of 50 mrad, a ramp, steps of 200 mrad; gusts up to 80 m/s."""
+    k = np.arange(steps)
+    b = np.column_stack([
+        0.05 * np.where(k // 25 % 2, -1, 1), 1e-3 * k, 0.2 * (k > steps // 3) - 0.4 * (k > steps // 2)
+    ])  # fmt: skip
+    return b, np.column_stack([80 * np.sin(0.2 * k), 60.0 * (k > steps // 4)])
+
+
+@pytest.mark.parametrize("name", ["robust_three_stage_cdkf", "robust_three_stage_ekf"])
+def test_robust_filter_follows_any_fault_and_gust_exactly_without_noise(name):
+    model = linearised_helicopter(channels=P3)
+    b, d = arbitrary_signals(120)
+    y, x = rows_flown(model, b, d, np.zeros((120, 11)), np.zeros((121, 9)))
+    diagnoser = build(name, model, thresholds=[1.0] * 3)
+    state = diagnoser.init(1)
+    for k, row in enumerate(shown(model, y)[0]):
+        state, said = diagnoser.update(state, row[None])
+        if k:
+            assert said.theta[0] == pytest.approx(b[k - 1], abs=1e-7)
+            assert state[1].d[0] == pytest.approx(d[k - 1], abs=1e-5)
+            assert state[1].x[0] == pytest.approx(x[k], abs=1e-7)
+
+
+@pytest.mark.parametrize("runs", [200, pytest.param(2000, marks=pytest.mark.slow)])
+def test_robust_filter_is_unbiased_and_knows_its_variance(runs):
+    model = linearised_helicopter(channels=P3)
+    at, H = trim_model(model, fault_inputs(model)), linear_output(model)
+    steps, rng = 200, np.random.default_rng(6)
+    b, d = arbitrary_signals(steps)
+    x0_std = np.array(find_diagnoser("robust_three_stage_ekf").build.__kwdefaults__["x0_std"])
+    x = rng.standard_normal((runs, 11)) * x0_std
+    s = robust_three_stage.start(runs, np.zeros(11), np.diag(x0_std**2), 3, 2)
+    tile = [np.broadcast_to(M, (runs, *M.shape)) for M in (at.B, at.E)]
+    scores, ratios = [], []
+    for k in range(steps):
+        x = x @ at.A.T + at.B @ b[k] + at.E @ d[k] + rng.standard_normal((runs, 11)) * huav_hover.SIGMA_W
+        y = x @ H.T + rng.standard_normal((runs, 9)) * huav_hover.SIGMA_V
+        s = robust_three_stage.step(
+            Propagated(s.x @ at.A.T, at.A @ s.P @ at.A.T, np.broadcast_to(at.A, s.P.shape), None, *tile),
+            y, H, model.Q, model.R,
+        )  # fmt: skip
+        error = np.hstack([s.b - b[k], s.d - d[k], s.x - x])
+        predicted = np.sqrt(np.concatenate([np.diagonal(c[0]) for c in (s.cov_b, s.cov_d, s.P)]))
+        scores.append(error.mean(axis=0) / (predicted / np.sqrt(runs)))
+        ratios.append(error.std(axis=0) / predicted)
+    scores, ratios = np.array(scores), np.array(ratios)
+    assert np.sqrt((scores**2).mean()) == pytest.approx(1, abs=0.15)
+    assert np.abs(scores).max() < 4.5
+    assert ratios.min() > 1 - 4.5 / np.sqrt(2 * runs)
+    assert ratios.max() < 1 + 4.5 / np.sqrt(2 * runs)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_filters_run_on_another_plant_with_a_gust(name):
+    """The 747's lateral motion with a side gust as unknown input, its fault a stuck deflection."""
+    A, B = b747_lateral.discretise(b747_lateral.A_PRINTED, b747_lateral.B_PRINTED)
+    E = (np.eye(4) - A)[:, :1]  # a gust is a change of the sideslip that the airframe feels
+    model = linear_plant(A, np.zeros((4, 2)), B, E, np.eye(4), b747_lateral.SIGMA_W, b747_lateral.SIGMA_V, dt=0.1)
+    rng = np.random.default_rng(7)
+    w, v = rng.standard_normal((600, 4)) * b747_lateral.SIGMA_W, rng.standard_normal((601, 4)) * b747_lateral.SIGMA_V
+    y, _ = rows_flown(model, np.tile([3.0, 2.0], (600, 1)), 2 * np.ones((600, 1)), w, v)
+    tuning = {"x0_std": [0.1] * 4, "thresholds": [0.5, 0.5]}
+    if "robust" not in name:
+        tuning |= {"b0_std": 2.0, "b_step": 0.05, "d0_std": 1.0, "d_step": 0.05}
+    _, said = last_state(build(name, model, alpha=0.01, **tuning), shown(model, y))
+    (_, _, flag), _ = last_state(build(name, model, alpha=0.01, **tuning), shown(model, y))
+    assert flag.s[0] == pytest.approx([3.0, 2.0], abs=4 * 0.01**0.5 * said.theta_std[0].max() + 0.2)
+    assert said.alarm[0]
+
+
+# -- flags
+
+
+def flagged(smoothed, **tuning):
+    """Flag (one channel, threshold 1) after each of these smoothed values."""
+    state, found = flags.start(1, 1), ""
+    for value in smoothed:
+        state = flags.step(state, np.array([[value]]), 1.0, np.ones(1), **tuning)
+        found += ".F"[int(state.on[0, 0])]
+    return found
+
+
+def test_flag_needs_three_in_a_row_and_clears_after_twenty_low_ones():
+    assert flagged([2, 2, 0.9, 2, 2, 2, 0.7, 2]) == ".....FFF"
+    assert flagged([2] * 3 + [0.4] * 19 + [0.6] + [-0.4] * 20) == ".." + "F" * 40 + "."
+    assert flagged([2] * 3 + [0.4] * 20 + [2, 2, 2]) == ".." + "F" * 20 + "...F"
+    assert flagged([-2, 2, -2]) == "..F"
+
+
+def test_smoothing_starts_at_zero():
+    state = flags.step(flags.start(1, 1), np.ones((1, 1)), 0.2, np.ones(1))
+    state = flags.step(state, np.ones((1, 1)), 0.2, np.ones(1))
+    assert state.s[0, 0] == pytest.approx(0.36)
+
+
+def test_label_is_the_flagged_set(plant):
+    labels, sets = flags.label_sets(plant, fault_inputs(plant))
+    names = [label.name for label in plant.labels]
+
+    def said(on, severity):
+        return names[flags.label_of_flags(labels, sets, np.array([on], bool), np.array([severity], float))[0]]
+
+    assert said([0, 0, 0, 0], [9, 9, 9, 9]) == "none"
+    assert said([0, 1, 0, 0], [9, 0, 9, 9]) == "lon"
+    assert said([1, 0, 0, 1], [1, 9, 9, 0]) == "col+ped"
+    assert said([1, 1, 0, 1], [3, 1, 9, 2]) == "col+ped"  # no label has three: the most severe two
+    labels, sets = flags.label_sets(plant, fault_inputs(plant, P3))
+    assert [names[i] for i in labels] == ["none", "lon", "lat", "ped", "lon+lat", "lon+ped", "lat+ped"]
+
+
+def test_bank_transitions():
+    sets = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], bool)
+    Pi = transitions(sets, 0.01, 0.1)
+    assert Pi[0] == pytest.approx([0.98, 0.01, 0.01, 0])
+    assert Pi[1] == pytest.approx([0.1, 0.89, 0, 0.01])
+    assert Pi[3] == pytest.approx([0, 0.1, 0.1, 0.8])
+
+
+# -- conduct
+
+
+def test_plant_conforms(plant):
+    check_plant(plant, range(3))
+    check_streams(plant)
+
+
+@pytest.mark.parametrize("task", ["isolation", "identification"])
+def test_vector_environment_equals_single_ones(plant, task):
+    check_vector_env(plant, n=3, steps=150, task=task)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_diagnoser_conforms(plant, name):
+    clairvoyant = find_diagnoser(name).clairvoyant
+
+    def fresh(plant, scenarios):
+        return build(name, plant, **({"scenarios": scenarios} if clairvoyant else {}))
+
+    check_diagnoser(fresh, plant, samples=120)
+
+
+def test_channels_left_out_are_taken_as_healthy(plant):
+    obs = simulate(plant, [huav_hover.paper(3)]).obs[:, :420]
+    _, said = last_state(build("three_stage_cdkf", plant, channels=P3), obs)
+    assert said.theta[0, 0] == 0
+    assert said.theta_std[0, 0] == 0
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("name", [*FILTERS, "hypothesis_bank"])
+def test_a_lost_filter_is_counted_and_its_neighbours_go_on(plant, name):
+    obs = simulate(plant, [huav_hover.episode(s) for s in range(3)]).obs[:, :60]
+    wrecked = obs.copy()
+    wrecked[1, 30, :9] = 1e300
+    said = run(guarded(build(name, plant), plant), wrecked)
+    assert (said.mode[1, 31:] == -1).all()
+    assert np.isnan(said.theta[1, 31:]).all()
+    clean = run(guarded(build(name, plant), plant), obs)
+    for i in (0, 2):
+        assert np.array_equal(said.mode[i], clean.mode[i])
+        assert said.theta[i] == pytest.approx(clean.theta[i], rel=1e-9, abs=1e-12)
+
+
+# -- slow
+
+
+def covariances(name, s):
+    """The covariances that a filter's state carries."""
+    if name == "hypothesis_bank":  # the errors that a hypothesis excludes have none
+        return [s.P[:, :, :11, :11], s.P[:, :, 15:, 15:]]
+    if name == "ascdkf":
+        return [s.P]
+    return [s.Px, s.Pb, s.Pd] if name.startswith("three") else [s.P, s.cov_b, s.cov_d]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*FILTERS, "hypothesis_bank"])
+def test_covariances_stay_positive_definite_over_a_long_flight(plant, name):
+    """A thousand seconds with faults that come and go."""
+    steps = 50_000 if name != "hypothesis_bank" else 10_000
+    faults = [huav_hover.bias(P4[i % 4], 0.008 * (-1) ** (i // 4), 1000 * i + 300, 1000 * i + 700)
+              for i in range(steps // 1000)]  # fmt: skip
+    scenario = FaultScenario(plant=plant.id, steps=steps, faults=faults, disturbance=huav_hover.PAPER_GUSTS)
+    record = simulate(plant, [scenario])
+    assert not record.terminated[0]
+    diagnoser = build(name, plant)
+    state = diagnoser.init(1)
+    for k in range(steps + 1):
+        state, said = diagnoser.update(state, record.obs[:, k])
+        if k % 50:
+            continue
+        for P in covariances(name, state[1]) if k else ():
+            assert np.array_equal(P, np.swapaxes(P, -1, -2)), f"sample {k}"
+            assert (np.linalg.eigvalsh(P) > 0).all(), f"sample {k}"
+        assert np.isfinite(said.theta).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "channels", "kappa"), [
+    ("three_stage_cdkf", P4, 0.3), ("robust_three_stage_cdkf", P4, 0.3), ("ascdkf", P3, 0.0),
+])  # fmt: skip
+def test_thresholds_are_those_of_the_fault_free_flights(name, channels, kappa):
+    plant = load_plant(huav_hover.ID, kappa=kappa)
+    found = calibrate(plant, build(name, plant, channels=channels, thresholds=[1.0] * len(channels)))
+    assert found / MRAD == pytest.approx(TABLE[huav_hover.ID, channels, (kappa, 0.84)][name], abs=0.00051)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kappa", "shares"), [
+    (0.0, (0.866, 0.962, 0.989, 1.0)), (0.3, (0.824, 0.920, 0.969, 0.985)), (1.0, (0.771, 0.885, 0.924, 0.950)),
+])  # fmt: skip
+def test_matched_oracle_attributes_as_the_data_sheet_says(kappa, shares):
+    scenarios = [s for s in map(huav_hover.episode, range(400)) if len(s.faults) == 1]
+    assert len(scenarios) == 262
+    plant = load_plant(huav_hover.ID, kappa=kappa)
+    record = simulate(plant, scenarios)
+    said = run(build("matched_oracle", plant, scenarios=scenarios), record.obs)
+    i, fault = np.arange(262), [s.faults[0] for s in scenarios]
+    truth = np.array([1 + P4.index(f.mode) for f in fault])
+    onset, end = np.array([f.onset for f in fault]), np.array([f.end for f in fault])
+    for window, share in zip((10, 25, 50, 100), shares, strict=True):
+        k = np.minimum(np.minimum(onset + window, end), record.length)
+        assert (said.mode[i, k] == truth).mean() == pytest.approx(share, abs=0.00051)
