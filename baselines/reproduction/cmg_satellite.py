@@ -244,6 +244,7 @@ def main(arguments: Arguments) -> None:
     jobs |= {f"tracking-{g}": (tracking_piece, (g,)) for g in ("slew", "regulate")}
     kept = arguments.work / ("quick" if arguments.quick else "full")
     extra = pieces(kept, jobs, arguments.workers)
+    planned = len(wanted)
     if arguments.finished_only:
         wanted = [p for p in wanted if (arguments.work / f"{p.name()}.json").exists()]
     r = Results(campaign(arguments.work, wanted, arguments.workers))
@@ -253,6 +254,8 @@ def main(arguments: Arguments) -> None:
     severity_figure(r, page.with_name("cmg_severity.png"))
     tables = reference_tables(r, extra)
     stars = f"{sum(r.tally)} of {len(r.tally)} compared figures agree within three standard errors."
+    if len(wanted) < planned:
+        stars += f" Of {planned} blocks {len(wanted)} have been run; rows without any are left out."
     picture = "## Tracking\n\nTable 4's time line.\n\n![fault tracking](cmg_tracking.png)"
     page.write_text("\n\n".join([INTRODUCTION + "\n" + stars, verdicts(r), picture, source_tables(r), tables]) + "\n")
     print(page)
