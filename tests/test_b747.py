@@ -225,3 +225,21 @@ def test_dual_labels_are_mixed_radix():
 def test_unknown_variant_lists_what_exists():
     with pytest.raises(ValueError, match="printed/open, printed/closed, bare/closed"):
         build("B747Lateral", variant="stretched")
+
+
+def test_a_held_gust_is_a_shift_of_the_air():
+    """In the steady state of a held gust beta follows it: the aircraft weathercocks, and all air loads vanish."""
+    x = np.zeros((1, 4))
+    for _ in range(1000):
+        x = build("B747Lateral").propagate(0.0, x, np.zeros((1, 2)), None, np.array([[1.0]]))
+    assert x[0] == pytest.approx([1, 0, 0, 0], abs=1e-9)
+
+
+def test_gust_shape():
+    scenario = b747.paper().replace(disturbance={"t0": 10.0, "rise": 2.0, "size": 1.5, "hold": 5.0})
+    d = b747.gust_rows(scenario)[:, 0]
+    assert (d[:101] == 0).all()
+    assert d[110] == pytest.approx(0.75)
+    assert d[120:171] == pytest.approx(np.full(51, 1.5))
+    assert d[180] == pytest.approx(0.75)
+    assert d[190:] == pytest.approx(np.zeros(len(d) - 190))

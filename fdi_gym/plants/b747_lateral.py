@@ -2,16 +2,20 @@
 
 Linear motion about steady flight at 826.772 ft/s and 35,000 ft; angles in degrees, rates in deg/s, as the source has it.
 
-    xdot = A x + B u_eff,   u_eff,i = (1 + gamma_i) u_i + b_i,   y = x + v
+    xdot = A x + B u_eff + E d,   u_eff,i = (1 + gamma_i) u_i + b_i,   y = x + v
 
 | vector | entries |
 |---|---|
 | state x | sideslip beta [deg], roll rate p [deg/s], yaw rate r [deg/s], bank angle phi [deg] |
 | command u | aileron [deg] (positive rolls left), rudder [deg] (positive yaws left); clipped to 20 and 4 deg |
+| disturbance d | lateral gust, as the sideslip beta_g [deg] that it adds to the air's; 0 but in the process "gust" |
 | fault theta | loss of effectiveness gamma of aileron and rudder in [-1, 0]; stuck position b of each [deg] |
 
 Loss of effectiveness (LOE) has gamma in (-1, 0) and b = 0; a stuck surface has gamma = -1 and its position in b: anywhere,
 where it was commanded at the onset (jam), at the limit (hard-over) or free (float, b = 0).
+
+The air loads follow beta - beta_g, so a gust enters through the first column of A: E = -A[:, 0]. The source has no gust;
+it is here so that methods for unknown inputs meet this plant too.
 
 Variants: "printed/open" and "printed/closed" use the matrix A of the source, which already contains a rudder feedback;
 "bare/closed" is the airframe built from the derivative table, whose yaw damper works through the rudder that fails.
@@ -100,15 +104,20 @@ def discretise(A: np.ndarray, B: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return M[:4, :4], M[:4, 4:]
 
 
+def gust_input(A: np.ndarray) -> np.ndarray:
+    """Ed (4,) of a gust angle held over one sample: the air loads follow beta - beta_g."""
+    return -(discretise(A, np.column_stack([A[:, 0], np.zeros(4)]))[1])[:, 0]
+
+
 @kernel
 def dynamics(t, x, u, theta, d, p, dx):
-    """The next state: Ad x + Bd u_eff, with Ad and Bd row by row in p."""
+    """The next state: Ad x + Bd u_eff + Ed beta_g, with Ad and Bd row by row and Ed in p."""
     aileron = (1.0 + theta[0]) * u[0] + theta[2]
     rudder = (1.0 + theta[1]) * u[1] + theta[3]
     for i in range(4):
         dx[i] = (
             p[4 * i] * x[0] + p[4 * i + 1] * x[1] + p[4 * i + 2] * x[2] + p[4 * i + 3] * x[3]
-            + p[16 + 2 * i] * aileron + p[17 + 2 * i] * rudder
+            + p[16 + 2 * i] * aileron + p[17 + 2 * i] * rudder + p[24 + i] * d[0]
         )  # fmt: skip
 
 
@@ -178,6 +187,17 @@ def reference_rows(scenario: FaultScenario) -> np.ndarray:
             s = a * s + (1 - a) * level[k]
             phi_ref[k] = s
     return np.column_stack([excitation(scenario.reference, steps), phi_ref])
+
+
+def gust_rows(scenario: FaultScenario) -> np.ndarray:
+    """d (steps + 1, 1): one gust, 1 - cos up in `rise` s from t0 to size [deg], `hold` s there, and down again."""
+    d = np.zeros((scenario.steps + 1, 1))
+    if scenario.disturbance:
+        t0, rise, size, hold = (scenario.disturbance[name] for name in ("t0", "rise", "size", "hold"))
+        s = np.arange(scenario.steps + 1) * DT - t0
+        up, down = (0.5 * (1 - np.cos(np.pi * np.clip(x / rise, 0, 1))) for x in (s, s - rise - hold))
+        d[:, 0] = size * (up - down)
+    return d
 
 
 def draw_reference(rng: np.random.Generator, low: float, high: float, closed: bool) -> dict[str, Any]:
@@ -261,6 +281,13 @@ def processes(airframe: str, closed: bool, dual: bool) -> dict[str, FaultProcess
                 onset = end + int(rng.integers(100, 251))
         return flight(rng, faults, 0.6, 1.6).replace(physical=perturb(rng, 0.05))
 
+    def gusty(rng: np.random.Generator) -> FaultScenario:
+        disturbance = {
+            "t0": float(rng.uniform(15, 90)), "rise": float(rng.uniform(1, 4)), "size": float(rng.uniform(-2, 2)),
+            "hold": float(rng.uniform(0, 10)),
+        }  # fmt: skip
+        return standard(rng).replace(disturbance=disturbance)
+
     def hard_over(rng: np.random.Generator) -> FaultScenario:
         i, onset = int(rng.integers(2)), int(rng.integers(200, 801))
         return flight(rng, [stuck(SURFACES[i], U_MAX[i] * float(rng.choice([-1, 1])), onset, kind="hard-over")])
@@ -276,6 +303,7 @@ def processes(airframe: str, closed: bool, dual: bool) -> dict[str, FaultProcess
         FaultProcess(name="standard", description="one permanent fault in 80 % of the flights", sample=standard),
         FaultProcess(name="hard", description="intermittent faults, plant off the model by 5 %", sample=hard,
                      scoring=Scoring(start=151, grace=50)),
+        FaultProcess(name="gust", description="the standard faults, and one lateral gust in every flight", sample=gusty),
         FaultProcess(name="fault-free", description="the standard flights without their faults", sample=fault_free),
         FaultProcess(name="hard-over", description="a surface runs to its limit", sample=hard_over),
         FaultProcess(name="float", description="a surface floats at zero", sample=floating),
@@ -340,7 +368,7 @@ def plant(*, variant: str = "printed/open", labels: str = "single") -> Plant:
         A_true, B_true = A.copy(), B * np.array(changes.get("factor_B", 1.0))
         A_true[:3] *= np.array(changes.get("factor_A", 1.0))
         Ad, Bd = discretise(A_true, B_true)
-        return np.concatenate([Ad.ravel(), Bd.ravel()])
+        return np.concatenate([Ad.ravel(), Bd.ravel(), gust_input(A_true)])
 
     travel = {"aileron": U_MAX[0], "rudder": U_MAX[1]}
     return Plant(
@@ -362,4 +390,5 @@ def plant(*, variant: str = "printed/open", labels: str = "single") -> Plant:
         modes=_modes(airframe), labels=_labels(labels == "dual"),
         processes=processes(airframe, loop == "closed", labels == "dual"),
         q=np.concatenate([gain.ravel(), U_MAX]), physical=physical, perturb=perturb, reference=reference_rows,
+        disturbances=(Signal("beta_g", "deg", -15.0, 15.0, 1.0),), disturbance=gust_rows,
     )  # fmt: skip
