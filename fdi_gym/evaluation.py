@@ -85,6 +85,16 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         """The digest that `sha256` must equal."""
         return digest({k: v for k, v in msgspec.structs.asdict(self).items() if k != "sha256"})
 
+    def sealed(self) -> Suite:
+        """The suite with its digests, computed."""
+        drawn = scenarios_digest(self.scenarios(self.build(), range(self.episodes)))
+        suite = msgspec.structs.replace(self, scenarios_sha256=drawn)
+        return msgspec.structs.replace(suite, sha256=suite.content_sha256())
+
+    def head(self, episodes: int) -> Suite:
+        """The first episodes as a suite of their own, for a quick look; its rows are not rows of this one."""
+        return msgspec.structs.replace(self, name=f"{self.name}-{episodes}", episodes=episodes).sealed()
+
     def build(self) -> Plant:
         """The plant."""
         if ":" in self.env:
@@ -131,10 +141,7 @@ def freeze(suite: Suite, folder: Path = SUITES) -> Path:
     Raises:
         ValueError: A suite of that name and another content exists.
     """
-    plant = suite.build()
-    drawn = scenarios_digest(suite.scenarios(plant, range(suite.episodes)))
-    suite = msgspec.structs.replace(suite, scenarios_sha256=drawn)
-    suite = msgspec.structs.replace(suite, sha256=suite.content_sha256())
+    suite = suite.sealed()
     path = folder / f"{suite.name}.json"
     if path.exists() and msgspec.json.decode(path.read_bytes(), type=Suite).sha256 != suite.sha256:
         raise ValueError(f"{path} is frozen with another content; choose another name")

@@ -96,7 +96,7 @@ def robustness_section(found: dict[str, Any], verdicts: Verdicts) -> str:
                  f"{corner['early']}/64, ratio {corner['ratio']:.4f}", corner["early"] == 0)  # fmt: skip
     verdicts.add("under random errors: no early alarm, true class never excluded", "0", "0" if clean else "some", clean)
     text = "## Robustness of that scenario\n\nEach cell reads reference / here; times in s as minimum, median, maximum. "
-    text += "The random errors are other draws than the reference's.\n\n"
+    text += "The random errors are other draws than the reference's. The noisy ratio is that of the q channel.\n\n"
     head = ["case", "false or early alarms", "largest ratio", "T_d", "T_s", "true class excluded"]
     text += markdown(head, rows)
     rows, same = [], True

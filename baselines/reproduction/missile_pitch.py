@@ -71,6 +71,7 @@ def adaptive_bank(plant: Plant, obs: Array, classes: Sequence[int], sigma: Array
         bank = isolation.advance(bank, detector, sample, classes)
         shown = {
             "alarm": detector.alarm, "ratio": (np.abs(detector.eps) / detector.threshold).max(axis=1),
+            "ratio_q": np.abs(detector.eps[:, 1]) / detector.threshold[:, 1],
             "eps": detector.eps[:, 1], "threshold": detector.threshold[:, 1], "fhat": detector.fhat,
             "residual": bank.eps[..., 1], "lambda": bank.threshold[..., 1], "theta": bank.used, "excluded": bank.excluded,
             "strict": isolation.strict_verdict(bank, classes), "tie_broken": isolation.tie_broken(bank, classes),
@@ -166,7 +167,7 @@ def robustness(label: int, noisy: bool, runs: int, corners: bool = False) -> dic
             "true_excluded": int(found["excluded"][:, -1, label - 1].sum()),
         }  # fmt: skip
     else:
-        result["ratio"] = float(found["ratio"].max())
+        result["ratio"] = float(found["ratio_q" if noisy else "ratio"].max())
     return result
 
 

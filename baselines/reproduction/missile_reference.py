@@ -18,7 +18,7 @@ STUDY = {  # quantity: (the study, the data sheet's implementation)
     "mirror: Theorem 2's condition first met [s]": (None, 13.24),
 }
 
-ROBUSTNESS = {  # case: largest ratio; T_d and T_s as (min, median, max)
+ROBUSTNESS = {  # case: largest ratio (noisy: of the q channel); T_d and T_s as (min, median, max)
     "no fault, noise-free": (0.906, None, None),
     "no fault, noisy": (0.834, None, None),
     "no fault, 64 corners": (0.9905, None, None),

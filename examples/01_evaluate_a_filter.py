@@ -1,0 +1,16 @@
+"""Show a filter the same flights that everybody else is shown, and read its scores."""
+
+from pathlib import Path
+from tempfile import mkdtemp
+
+from fdi_gym.evaluation import evaluate, load_suite
+from fdi_gym.leaderboard import confusion_table, table
+
+suite = load_suite("b747-standard").head(20)  # the first 20 of the frozen 400 episodes
+names = ["null", "two_stage_kf", "two_stage_kf_exponential", "known_onset_oracle"]
+
+if __name__ == "__main__":
+    rows, microseconds = evaluate(suite, names, work=Path(mkdtemp()), jobs=1)
+    print(table(list(rows.values()), microseconds))
+    print()
+    print(confusion_table(rows["two_stage_kf_exponential"], [label.name for label in suite.build().labels]))
