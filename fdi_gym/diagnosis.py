@@ -11,7 +11,7 @@ plain number in it (a sample counter) is shared by all episodes. A builder makes
     @diagnoser("two_stage_kf", "Two-stage Kalman filter")
     def two_stage_kf(plant: Plant, *, forgetting: str = "none") -> Diagnoser: ...
 
-Builders in the packages of the entry-point group "fdi_gym.diagnosers" are discovered; nothing is listed.
+Builders in the modules and packages of the entry-point group "fdi_gym.diagnosers" are discovered; none is listed.
 """
 
 from __future__ import annotations
@@ -98,8 +98,8 @@ def diagnoser(name: str, summary: str, *, clairvoyant: bool = False, **settings:
 @functools.cache
 def _import_packages() -> None:
     for entry_point in entry_points(group="fdi_gym.diagnosers"):
-        package = entry_point.load()
-        for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        place = entry_point.load()
+        for module in pkgutil.walk_packages(getattr(place, "__path__", []), place.__name__ + "."):
             importlib.import_module(module.name)
 
 

@@ -22,13 +22,12 @@ file that defines the kernel, so that no edit is ever answered by old code.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import inspect
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -66,45 +65,67 @@ def _package_hash() -> str:
     return digest.hexdigest()[:16]
 
 
-@contextlib.contextmanager
-def _cache_folder(source: str) -> Iterator[bool]:
-    """Point numba at the cache folder that belongs to these sources; yields False where it cannot be written."""
-    own = hashlib.sha256(Path(source).read_bytes()).hexdigest()[:16] if Path(source).is_file() else "interactive"
+_signatures: dict[Any, Any] = {}  # of the kernels, compiled when they are first needed
+_announced: set[str] = set()  # source files whose cold compilation has been announced
+
+
+@functools.cache
+def _cache_folder(source: str) -> Path | None:
+    """The cache folder that belongs to these sources; None where there can be none."""
+    if not Path(source).is_file():
+        return None
+    own = hashlib.sha256(Path(source).read_bytes()).hexdigest()[:16]
     base = Path(os.environ.get("FDI_GYM_CACHE_DIR") or platformdirs.user_cache_path("fdi_gym"))
     folder = base / f"{_package_hash()}-{own}"
     try:
-        cold = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
-        writable = own != "interactive" and os.access(folder, os.W_OK)
     except OSError:
-        cold, writable = True, False
-    if cold and own != "interactive":
-        print(f"fdi_gym: compiling {Path(source).stem} (once; kept in {base})", file=sys.stderr, flush=True)
+        return None
+    return folder if os.access(folder, os.W_OK) else None
+
+
+def _lazily(function: Callable[..., Any], signature: Any) -> Any:
+    """The function as numba's dispatcher, cached in the folder of its sources; nothing is compiled yet."""
+    folder = _cache_folder(function.__code__.co_filename)
     settings: Any = config
     before = settings.CACHE_DIR
-    settings.CACHE_DIR = str(folder) if writable else before
+    settings.CACHE_DIR = before if folder is None else str(folder)
     try:
-        yield writable
+        dispatcher = numba.njit(cache=folder is not None, error_model="numpy")(function)
     finally:
         settings.CACHE_DIR = before
+    _signatures[dispatcher] = signature
+    return dispatcher
+
+
+def _compiled(dispatcher: Any) -> Any:
+    """The dispatcher, compiled for its role's signature or loaded from the cache."""
+    if not dispatcher.overloads:
+        source = dispatcher.py_func.__code__.co_filename
+        folder = _cache_folder(source)
+        if source not in _announced and not (folder and any(folder.rglob("*.nbi"))):
+            print(f"fdi_gym: compiling {Path(source).stem} (once; kept in {folder})", file=sys.stderr, flush=True)
+        _announced.add(source)
+        dispatcher.compile(_signatures[dispatcher])
+        dispatcher.disable_compile()  # other types are an error, not another compilation
+    return dispatcher
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile a plant's function for the role that its parameter names declare (see the module's docstring)."""
+    """Make a plant's function a kernel of the role that its parameter names declare (see the module's docstring)."""
     role = _ROLES.get(tuple(inspect.signature(function).parameters))
     if role is None:
         return numba.njit(error_model="numpy")(function)
-    with _cache_folder(function.__code__.co_filename) as writable:
-        return numba.njit(role, cache=writable, error_model="numpy")(function)
+    return _lazily(function, role)
 
 
 # ---------------------------------------------------------------------------------------------------------------
 # Plant functions as numbers
 
 
-def address(compiled: Any) -> int:
-    """The address of a compiled kernel, by which the generic kernels call it. Valid as long as `compiled` lives."""
-    (result,) = compiled.overloads.values()
+def address(dispatcher: Any) -> int:
+    """The address of a kernel, compiled if need be, by which the generic kernels call it. Valid as long as it lives."""
+    (result,) = _compiled(dispatcher).overloads.values()
     return result.library.get_pointer_to_function(result.fndesc.llvm_func_name)
 
 
@@ -154,11 +175,16 @@ def outside(t, x, r):
 
 
 def _generic(signature: Any) -> Callable[[Any], Any]:
-    """Compile a generic kernel of this file with its explicit signature, cached."""
+    """Make a generic kernel of this file: compiled for this signature at its first call, cached."""
 
-    def decorate(function):
-        with _cache_folder(__file__) as writable:
-            return numba.njit(signature, cache=writable, error_model="numpy")(function)
+    def decorate(function: Callable[..., Any]) -> Any:
+        dispatcher = _lazily(function, signature)
+
+        @functools.wraps(function)
+        def call(*arguments: Any) -> Any:
+            return _compiled(dispatcher)(*arguments)
+
+        return call
 
     return decorate
 

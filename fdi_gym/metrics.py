@@ -127,6 +127,7 @@ def outcome(plant: Plant, scoring: Scoring, record: Record, said: Decisions, i: 
     squares, steps = [[0.0] * len(plant.estimated) for _ in PHASES], [0] * len(PHASES)
     if said.theta is not None:
         error = (said.theta[i] - record.target[i]) ** 2
+        phase[~np.isfinite(error).all(axis=1)] = -1  # a lost filter has no estimate; `lost` counts it
         for p in range(len(PHASES)):
             squares[p] = [float(v) for v in error[phase == p].sum(axis=0)]
             steps[p] = int((phase == p).sum())

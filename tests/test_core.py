@@ -179,14 +179,16 @@ def test_importing_imports_nothing_heavy():
     assert heavy == ""
 
 
-def test_listing_diagnosers_compiles_no_plant():
+def test_listing_compiles_nothing(tmp_path):
     loaded = run_python("""
         import sys
-        from fdi_gym.diagnosis import diagnosers
-        assert "two_stage_kf" in diagnosers()
-        print(*[m for m in sys.modules if m.startswith("fdi_gym.plants.") or m in ("torch", "stable_baselines3")])
-    """)
-    assert loaded == ""
+        from fdi_gym.cli import main
+        main(["list"])
+        print("loaded:", *[m for m in ("torch", "stable_baselines3", "matplotlib") if m in sys.modules])
+    """, FDI_GYM_CACHE_DIR=str(tmp_path))  # fmt: skip
+    assert "two_stage_kf" in loaded
+    assert loaded.endswith("loaded:")
+    assert not list(tmp_path.rglob("*.nbi"))
 
 
 PLANT_FILE = """

@@ -321,7 +321,6 @@ def test_wrong_options_say_what_is_allowed(plant):
 
 
 @pytest.mark.parametrize("task", ["isolation", "identification"])
-@pytest.mark.filterwarnings("ignore:.*Box observation space.*:UserWarning")
 def test_environment(task):
     env = gym.make("HUAVHover-Faults-v0", task=task, kappa=0.0)
     check_env(env.unwrapped, skip_render_check=True)

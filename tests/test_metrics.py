@@ -117,6 +117,14 @@ def test_a_lost_diagnosis_is_wrong_and_counted():
     assert found["lost_episodes"] == 1
 
 
+def test_a_lost_estimate_leaves_the_error_of_the_others():
+    estimate = np.ones((4, 4))
+    estimate[3] = np.nan
+    only = episode(truth="..AA", said="..A?", estimate=estimate)
+    assert only.error_steps == [1, 1, 0]
+    assert np.isfinite(only.squared_error).all()
+
+
 def test_final_and_second_half_decisions():
     assert episode(truth="...AAAA", said="...SSSA").decision == (1, 1)
     # window of the fault: samples 3..8; second half 6..8: S, S, A

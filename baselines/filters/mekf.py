@@ -24,6 +24,8 @@ from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.cmg_satellite import DT, H0, JS, SIGMA_Q, cluster, inertia
 
 NIS_START = 6.0  # the mean of a chi-square with six degrees of freedom
+NIS_MAX, MEMORY = 10.0, 50  # detector: threshold of the weighted mean, and its length in steps
+P_RESET = 0.25  # variance of each effectiveness after a reset
 D_GAIN = 0.002  # gain of the gimbal angles towards the measured ones, at least
 
 
@@ -91,32 +93,18 @@ def changes(plant: Plant, scenarios: Sequence[FaultScenario]) -> Array:
     return found
 
 
-@diagnoser("mekf", "Multiplicative extended Kalman filter, covariance opened by a test on the innovations")
-def mekf(
+def mekf_filter(
     plant: Plant,
+    known_changes: Array | None = None,
     *,
     q_theta: float = Q_THETA,
     p_theta: float = P_THETA,
-    p_reset: float = 0.25,
-    nis_max: float = 10.0,
-    memory: int = 50,
+    p_reset: float = P_RESET,
+    nis_max: float = NIS_MAX,
+    memory: int = MEMORY,
     threshold: float = THRESHOLD,
-    known_changes: Array | None = None,
 ) -> Diagnoser:
-    """The filter with its detector.
-
-    Args:
-        plant: The satellite.
-        q_theta: Variance that each effectiveness gains per step.
-        p_theta, p_reset: Variance of each effectiveness at the start and after a reset.
-        nis_max: Threshold of the detector.
-        memory: Length of the detector's weighted mean, and of its pause after a reset, in steps.
-        threshold: A unit that has lost more is called faulty.
-        known_changes: (episodes, samples) bool: reset exactly there, in place of the detector.
-
-    Raises:
-        NotApplicableError: The plant has no attitude.
-    """
+    """The filter with its detector, or with resets at known changes (episodes, samples) bool."""
     require_attitude(plant)
     wheel = plant.options["fault_model"] == "wheel"
     R = plant.R[:6, :6]
@@ -179,6 +167,35 @@ def mekf(
     return Diagnoser(init, update)
 
 
+@diagnoser("mekf", "Multiplicative extended Kalman filter, covariance opened by a test on the innovations")
+def mekf(
+    plant: Plant,
+    *,
+    q_theta: float = Q_THETA,
+    p_theta: float = P_THETA,
+    p_reset: float = P_RESET,
+    nis_max: float = NIS_MAX,
+    memory: int = MEMORY,
+    threshold: float = THRESHOLD,
+) -> Diagnoser:
+    """The filter with its detector.
+
+    Args:
+        plant: The satellite.
+        q_theta: Variance that each effectiveness gains per step.
+        p_theta, p_reset: Variance of each effectiveness at the start and after a reset.
+        nis_max: Threshold of the detector.
+        memory: Length of the detector's weighted mean, and of its pause after a reset, in steps.
+        threshold: A unit that has lost more is called faulty.
+
+    Raises:
+        NotApplicableError: The plant has no attitude.
+    """
+    return mekf_filter(
+        plant, q_theta=q_theta, p_theta=p_theta, p_reset=p_reset, nis_max=nis_max, memory=memory, threshold=threshold
+    )
+
+
 @diagnoser("mekf_clairvoyant", "The same filter, told when the effectiveness changes", clairvoyant=True)
 def mekf_clairvoyant(
     plant: Plant, *, scenarios: Sequence[FaultScenario], q_theta: float = Q_THETA, threshold: float = THRESHOLD
@@ -194,4 +211,4 @@ def mekf_clairvoyant(
         NotApplicableError: The plant has no attitude.
     """
     require_attitude(plant)
-    return mekf(plant, q_theta=q_theta, threshold=threshold, known_changes=changes(plant, scenarios))
+    return mekf_filter(plant, changes(plant, scenarios), q_theta=q_theta, threshold=threshold)

@@ -14,7 +14,19 @@ from typing import Any
 import numpy as np
 import tyro
 
-from baselines.reproduction.b747_reference import EXCITATION, HARD, MISMATCH, NIS, PAPER, PAPER_LOGIC, RANDOM, RMSE
+from baselines.reproduction.b747_reference import (
+    DUAL,
+    EXCITATION,
+    FLOAT,
+    HARD,
+    HARD_OVER,
+    MISMATCH,
+    NIS,
+    PAPER,
+    PAPER_LOGIC,
+    RANDOM,
+    RMSE,
+)
 from baselines.reproduction.tables import compared, markdown, pieces
 from fdi_gym.diagnosis import Decisions, make_diagnoser, run
 from fdi_gym.faults import FaultScenario, draw
@@ -225,6 +237,39 @@ def hard_piece(variant: str, method: str, seed: int, count: int) -> dict[str, An
     }
 
 
+def dual_piece(method: str, seed: int, count: int) -> dict[str, Any]:
+    """One or two permanent faults, nine labels: acc, post, final, and false alarms on fault-free flights."""
+    plant = load_plant("B747Lateral", labels="dual")
+    scenarios = episodes(plant, "dual", count, seed)
+    record, said = watch(plant, scenarios, method)
+    first = np.array([min((f.onset for f in s.faults), default=10**6) for s in scenarios])[:, None]
+    right = said.mode == record.label
+    _, quiet = watch(plant, episodes(plant, "fault-free", count, seed + 50_000), method)
+    acc = right[:, 1:].mean(axis=1)
+    late = np.arange(right.shape[1]) > first
+    return {
+        "values": [float(acc.mean()), float(right[late].mean()), float(right[:, -1].mean()),
+                   float((quiet.mode > 0).any(axis=1).mean())],
+        "acc_error": float(acc.std() / math.sqrt(count)), "count": count,
+    }  # fmt: skip
+
+
+def surface_piece(variant: str, process: str, seed: int, count: int) -> dict[str, Any]:
+    """A floating or hard-over surface: per surface the late accuracy (per episode) and the largest |phi|."""
+    plant = load_plant("B747Lateral", variant=variant)
+    scenarios = episodes(plant, process, count, seed)
+    record, said = watch(plant, scenarios, "exponential 0.99")
+    k = np.arange(record.label.shape[1])
+    found: dict[str, Any] = {"late": [], "phi": []}
+    for surface in ("aileron", "rudder"):
+        mine = [i for i, s in enumerate(scenarios) if s.faults[0].mode == f"{surface} stuck"]
+        late = [(k > scenarios[i].faults[0].onset + 200) & (k <= record.length[i]) for i in mine]
+        right = [(said.mode[i] == record.label[i])[m] for i, m in zip(mine, late, strict=True) if m.any()]
+        found["late"].append([float(r.mean()) for r in right])
+        found["phi"].append(float(np.abs(record.state[mine][:, :, 3]).max()))
+    return found
+
+
 @dataclasses.dataclass
 class Arguments:
     """What to measure, and where it goes."""
@@ -258,6 +303,12 @@ def main(arguments: Arguments) -> None:
     for variant, methods in HARD.items():
         for method in methods:
             jobs[f"hard-{variant}-{method}"] = (hard_piece, (variant, method, 650_000, hard))
+    for method in DUAL:
+        jobs[f"dual-{method}"] = (dual_piece, (method, 620_000, count))
+    for variant in HARD_OVER:
+        jobs[f"over-{variant}"] = (surface_piece, (variant, "hard-over", 630_000, 2 * seeds + 80))
+    for variant in FLOAT:
+        jobs[f"float-{variant}"] = (surface_piece, (variant, "float", 640_000, 2 * seeds + 80))
     jobs = {name.replace("/", "_"): job for name, job in jobs.items()}
     folder = arguments.work / ("quick" if arguments.quick else "full")
     found = pieces(folder, jobs, arguments.workers)
@@ -363,6 +414,36 @@ def page(found: dict[str, Any], seeds: int, per_group: int, count: int, hard: in
         f"## Plant mismatch, printed/open, {count} + {count} fault-free episodes\n\n"
         + markdown(["delta", "method", "acc", "late", "FA"], rows) + "\n"
     )  # fmt: skip
+    rows = []
+    for method, reference in DUAL.items():
+        piece = found[f"dual-{method}"]
+        n, values = piece["count"], piece["values"]
+        errors = [
+            math.sqrt(2) * piece["acc_error"],
+            3 * piece["acc_error"],
+            math.sqrt(2 * 0.09 * 0.91 / n),
+            math.sqrt(0.01 / n),
+        ]
+        rows.append([method, *(
+            f"- / {o:.3f}" if math.isnan(r) else compared(r, o, e, tally=tally)
+            for r, o, e in zip(reference, values, errors, strict=True)
+        )])  # fmt: skip
+    head = ["method", "acc", "post", "final", "FA"]
+    parts.append(f"## Simultaneous faults, printed/open, {count} episodes, nine labels\n\n{markdown(head, rows)}\n")
+    rows = []
+    for variant, phi in HARD_OVER.items():
+        over = found[f"over-{variant}".replace("/", "_")]
+        row = [variant, ", ".join(f"{r:g} / {o:.1f}" for r, o in zip(phi, over["phi"], strict=True)),
+               ", ".join(f"{np.mean(v):.3f}" if v else "ended" for v in over["late"])]  # fmt: skip
+        if variant in FLOAT:
+            late = found[f"float-{variant}".replace("/", "_")]["late"]
+            row.append(", ".join(
+                compared(r, float(np.mean(v)), math.sqrt(2) * float(np.std(v)) / math.sqrt(len(v)), 2, tally)
+                for r, v in zip(FLOAT[variant], late, strict=True)
+            ))  # fmt: skip
+        rows.append([*row, "-"][:4])
+    head = ["variant", "hard-over: largest abs(phi), deg", "hard-over: late labels right", "float: late accuracy"]
+    parts.append(f"## Hard-over and float (aileron, rudder), exponential 0.99\n\n{markdown(head, rows)}\n")
     for variant, methods in HARD.items():
         rows = []
         for method, reference in methods.items():

@@ -165,3 +165,12 @@ HARD = {
         "known windows": (0.988, 0.975, 1.000),
     },
 }
+
+# dual faults, printed/open, 300 episodes: acc, post, final, FA (post not given for the second)
+DUAL = {"directional 1e-4": (0.843, 0.692, 0.910, 0.0), "exponential 0.99": (0.836, nan, 0.860, 0.007)}
+
+# exponential 0.99, 60 episodes each: late accuracy of a floating aileron, rudder
+FLOAT = {"printed/open": (0.63, 0.66), "bare/closed": (0.71, 0.71)}
+
+# exponential 0.99: largest |phi| after a hard-over of aileron, rudder, deg; every late label is right
+HARD_OVER = {"printed/open": (12.5, 9.6), "printed/closed": (11.8, 8.8), "bare/closed": (21.4, 107.7)}

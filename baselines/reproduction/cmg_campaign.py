@@ -110,7 +110,7 @@ def watch(plant: Plant, scenarios: list[FaultScenario], record: Record, method: 
         inner = state[0]
         if hasattr(inner, "beta"):
             flag[:, k] = (inner.beta > BETA_0) & (k > MEMORY + 1)
-        elif hasattr(inner, "resets"):
+        elif hasattr(inner, "resets") and not known:  # a reset that was told is no flag
             flag[:, k], resets = inner.resets > resets, inner.resets
     seconds = time.process_time() - begun
     per_step = {"caukf": 40, "gaukf": 16, "sgaukf": 4, "sgaukf_odd": 4, "dual_gaukf": 16, "dual_sgaukf": 4}.get(name, 0)

@@ -68,6 +68,8 @@ STATES = ("u", "v", "w", "p", "q", "r", "phi", "theta", "psi", "a1f", "b1f")
 U_MIN = (-0.02, -0.12, -0.12, -0.20)  # rad: command limits
 U_MAX = (0.20, 0.12, 0.12, 0.25)
 SIGMA_V = (0.05, 0.05, 0.05, 0.005, 0.005, 0.005, 0.009, 0.009, 0.009)  # m/s, rad/s, rad: sensors
+# Beyond anything that a flight can reach before it ends; psi is not wrapped
+SENSOR_RANGE = (100.0, 100.0, 100.0, 50.0, 50.0, 50.0, np.pi, np.pi, 1000.0)  # m/s, rad/s, rad
 SIGMA_W = (*(0.004,) * 3, *(0.005,) * 3, *(2e-4,) * 5)  # m/s, rad/s, rad, rad (flapping) per step: process
 B_MAX = (0.25, 0.15, 0.15, 0.50)  # rad: a stuck actuator lets |b| grow to the command limit
 B_SCALE = (0.005, 0.002, 0.002, 0.008)  # rad: error that costs 1 in the identification task
@@ -494,7 +496,7 @@ def plant(*, kappa: float = 0.3, K_B: float = 0.84) -> Plant:
     labels = _labels()
     accused = np.array([[c in label.modes for c in CHANNELS] for label in labels])
     wrongly = (accused[None] & ~accused[:, None]).sum(axis=2)
-    inf, lim = np.inf, (20.0, 20.0, 20.0, 8.0, 8.0, 8.0, np.pi / 3, np.pi / 3, np.inf, np.inf, np.inf)
+    lim = (20.0, 20.0, 20.0, 8.0, 8.0, 8.0, np.pi / 3, np.pi / 3, np.inf, np.inf, np.inf)
     units = ("m/s",) * 3 + ("rad/s",) * 3 + ("rad",) * 5
     scales = (0.5,) * 3 + (0.2,) * 3 + (0.1,) * 3 + (0.01,) * 2
     unit4 = np.eye(4)
@@ -505,8 +507,8 @@ def plant(*, kappa: float = 0.3, K_B: float = 0.84) -> Plant:
         kernels=Kernels(dynamics, output, control, outside=outside),
         states=tuple(Signal(n, unit, -high, high, scale, w, float(x)) for n, unit, high, scale, w, x in zip(
             STATES, units, lim, scales, SIGMA_W, x_trim, strict=True)),
-        outputs=tuple(Signal(n, unit, -inf, inf, scale, v, float(x)) for n, unit, scale, v, x in zip(
-            STATES[:9], units[:9], scales[:9], SIGMA_V, x_trim[:9], strict=True)),
+        outputs=tuple(Signal(n, unit, -high, high, scale, v, float(x)) for n, unit, high, scale, v, x in zip(
+            STATES[:9], units[:9], SENSOR_RANGE, scales[:9], SIGMA_V, x_trim[:9], strict=True)),
         commands=tuple(Signal(c, "rad", low, high, scale, 0.0, float(u)) for c, low, high, scale, u in zip(
             CHANNELS, U_MIN, U_MAX, (0.01, 0.01, 0.01, 0.02), u_trim, strict=True)),
         theta=(
@@ -515,7 +517,7 @@ def plant(*, kappa: float = 0.3, K_B: float = 0.84) -> Plant:
         ),
         estimated=tuple(Signal(c, "rad", -b, b, s) for c, b, s in zip(CHANNELS, B_MAX, B_SCALE, strict=True)),
         target=target,
-        disturbances=(Signal("u_g", "m/s", -inf, inf, 2.0), Signal("v_g", "m/s", -inf, inf, 2.0)),
+        disturbances=(Signal("u_g", "m/s", -50.0, 50.0, 2.0), Signal("v_g", "m/s", -50.0, 50.0, 2.0)),
         disturbance=disturbance_rows,
         modes=tuple(FaultMode(
             c, f"the {c} actuator is not where it is commanded: b_{c} = u_true - u_c", lambda th, i=i: _size(th, i),
