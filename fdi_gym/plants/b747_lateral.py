@@ -282,7 +282,7 @@ def processes(airframe: str, closed: bool, dual: bool) -> dict[str, FaultProcess
     ]  # fmt: skip
     if not closed:
         found.append(FaultProcess(name="paper", description="the source's: rudder stuck at 2 deg, 200 to 600 s",
-                                  sample=lambda rng: paper()))  # fmt: skip
+                                  sample=lambda rng: paper(), scoring=Scoring(decision="second_half")))  # fmt: skip
     if dual:
         found.append(FaultProcess(name="dual", description="one or two permanent faults", sample=two_faults))
     return {process.name: process for process in found}
