@@ -2,6 +2,7 @@
 
 import itertools
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -11,7 +12,7 @@ from baselines.filters import augmented_ekf_bank as bank
 from baselines.filters import augmented_ekf_imm as imm
 from baselines.filters import generalised_observer_scheme as isolation
 from baselines.filters import innovation_oracle as oracle
-from fdi_gym.diagnosis import NotApplicableError, make_diagnoser, run
+from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, make_diagnoser, run
 from fdi_gym.estimation import missile_ekf as ekf
 from fdi_gym.estimation import missile_model as model
 from fdi_gym.faults import FaultScenario
@@ -457,3 +458,10 @@ def test_scenario_without_faults_has_an_empty_oracle_window_when_hard(plant):
     obs = simulate(plant, [scenario]).obs[:, :60]
     said = run(make_diagnoser("innovation_oracle", plant, scenarios=[scenario], hard=True), obs)
     assert not said.alarm.any()
+
+
+@pytest.mark.parametrize("name", [*NAMES, "innovation_oracle"])
+def test_settings_of_a_name_can_be_written_to_a_row(name):
+    settings = dict(find_diagnoser(name).settings)
+    msgspec.json.encode(settings)
+    assert all(type(value) in (bool, int, float, str, tuple) for value in settings.values())

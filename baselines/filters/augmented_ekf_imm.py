@@ -23,7 +23,7 @@ from fdi_gym.plants.missile_pitch import DEG, DT
 
 RESTART_SD = np.array([0.0, 0.2, 0.2, 0.1, 2 * DEG, 0.2])  # of theta where a fault begins, l = 0..5
 RESTART_MEAN = np.array([0.0, 0.0, 0.0, 0.1, np.nan, 0.3])  # a jam begins at delta^
-SIGMA_RHO = 0.08 / np.sqrt(3)
+SIGMA_RHO = 0.08 / 3**0.5
 MU_MIN = 1e-8
 
 

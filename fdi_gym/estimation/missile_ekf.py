@@ -20,7 +20,7 @@ SIGMA_THETA = np.array([0.0, 0.05, 0.05, 0.05, 2 * DEG, 0.05])  # at the start, 
 Q_THETA = np.array([0.0, 0.10, 0.10, 0.05, 3 * DEG, 0.15]) ** 2  # per s
 THETA_MIN = np.array([0.0, -1.5, -1.5, 0.0, -30 * DEG, 0.0])
 THETA_MAX = np.array([0.0, 1.5, 1.5, 1.0, 30 * DEG, 1.0])
-SIGMA_RHO = 0.05 / np.sqrt(3)  # a uniform error of 5 %
+SIGMA_RHO = 0.05 / 3**0.5  # a uniform error of 5 %
 
 
 class Filters(NamedTuple):
