@@ -11,6 +11,7 @@ import functools
 import importlib
 import inspect
 import itertools
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -295,7 +296,7 @@ class Plant:
 
     def _rows(self, value: Array | None, default: Array) -> Array:
         rows = default if value is None else np.asarray(value, float)
-        return np.ascontiguousarray(rows.reshape(-1, rows.shape[-1]) if rows.ndim > 1 else rows[None, :])
+        return np.ascontiguousarray(rows.reshape(math.prod(rows.shape[:-1]), rows.shape[-1]))  # also of zero width
 
     def _rows_of(self, t: Any, x: Array, u: Array, theta: Any, d: Any, width: int) -> tuple[Array, ...]:
         """The arguments of a generic kernel from those of `propagate`, and an array for its output."""
