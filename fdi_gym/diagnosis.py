@@ -40,6 +40,7 @@ class Diagnosis(NamedTuple):
     theta: Array | None = None  # (n, n_estimated) estimate of what the identification task asks for
     theta_std: Array | None = None  # (n, n_estimated) its standard deviation
     mode_probs: Array | None = None  # (n, labels) probabilities, where the method has them
+    signals: dict[str, Array] | None = None  # (n, ...) each: residuals, thresholds, an approximated fault function
 
 
 class Diagnoser(NamedTuple):
@@ -272,14 +273,22 @@ class Decisions(NamedTuple):
     theta: Array | None  # (N, K + 1, n_estimated)
     theta_std: Array | None
     mode_probs: Array | None  # (N, K + 1, labels)
+    signals: dict[str, Array] | None = None  # (N, K + 1, ...) each, where they were asked for
 
 
-def run(diagnoser: Diagnoser, obs: Array) -> Decisions:
-    """Show recorded observations (N, K + 1, n_obs) to a diagnoser, sample by sample, and record what it says."""
+def run(diagnoser: Diagnoser, obs: Array, signals: bool = False) -> Decisions:
+    """Show recorded observations (N, K + 1, n_obs) to a diagnoser, sample by sample, and record what it says.
+
+    Args:
+        diagnoser: The diagnoser.
+        obs: The observations.
+        signals: Record the method's own signals too.
+    """
     n, samples, _ = obs.shape
     state = diagnoser.init(n)
     alarm, mode = np.zeros((n, samples), bool), np.zeros((n, samples), np.int16)
     wide: dict[str, Array | None] = {"theta": None, "theta_std": None, "mode_probs": None}
+    own: dict[str, Array] = {}
     for k in range(samples):
         state, said = diagnoser.update(state, obs[:, k])
         alarm[:, k], mode[:, k] = said.alarm, said.mode
@@ -290,4 +299,6 @@ def run(diagnoser: Diagnoser, obs: Array) -> Decisions:
                 if store is None:
                     store = wide[name] = np.full((n, samples, value.shape[1]), np.nan)
                 store[:, k] = value
-    return Decisions(alarm, mode, **wide)
+        for name, value in (said.signals or {}).items() if signals else ():
+            own.setdefault(name, np.full((n, samples, *value.shape[1:]), np.nan))[:, k] = value
+    return Decisions(alarm, mode, **wide, signals=own or None)

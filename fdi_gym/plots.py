@@ -141,3 +141,33 @@ def flight(plant: Plant, record: Record, said: dict[str, Any], i: int = 0, entri
     axes[0].legend(loc="upper left", fontsize=7, frameon=False, ncol=5, bbox_to_anchor=(0, 1.25))
     axes[-1].set_xlabel("time, s")
     return figure
+
+
+def method_signals(plant: Plant, record: Record, said: Any, i: int = 0) -> Any:
+    """A figure of what a method shows of itself (`run(..., signals=True)`): residuals, thresholds, approximations.
+
+    Args:
+        plant: The plant.
+        record: The flights.
+        said: Decisions with signals.
+        i: Which flight.
+
+    Raises:
+        ValueError: There are no signals.
+    """
+    from matplotlib.figure import Figure
+
+    if not said.signals:
+        raise ValueError("no signals were recorded: run(..., signals=True) with a method that has some")
+    figure = Figure(figsize=(9.6, 1.0 + 1.5 * len(said.signals)), dpi=120, layout="constrained")
+    axes = np.atleast_1d(figure.subplots(len(said.signals), 1, sharex=True))
+    length = int(record.length[i]) + 1
+    t = np.arange(length) * plant.dt
+    for axis, (name, values) in zip(axes, said.signals.items(), strict=True):
+        axis.plot(t, values[i, :length].reshape(length, -1), lw=0.9)
+        axis.set_ylabel(name, fontsize=8)
+        axis.spines[["top", "right"]].set_visible(False)
+        for first, stop in _spans(record.label[i, :length] > 0):
+            axis.axvspan(first * plant.dt, stop * plant.dt, color=SHADE, lw=0, zorder=0)
+    axes[-1].set_xlabel("time, s")
+    return figure

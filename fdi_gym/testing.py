@@ -208,7 +208,8 @@ def check_diagnoser(
         return guarded(raw, plant)
 
     everyone = list(range(len(scenarios)))
-    said = run(fresh(everyone), obs)
+    said = run(fresh(everyone), obs, signals=True)
+    shown = _arrays(said)
     n_labels = len(plant.labels)
     assert ((said.mode >= -1) & (said.mode < n_labels)).all(), "a mode is no label"
     if said.mode_probs is not None:
@@ -217,16 +218,16 @@ def check_diagnoser(
         assert np.allclose(probs.sum(axis=2), 1, atol=1e-6), "probabilities do not sum to 1"
     if said.theta_std is not None:
         assert not (said.theta_std < 0).any(), "a standard deviation is negative"
-    _equal(said, run(fresh(everyone), obs), "a second run differs: not deterministic")
-    alone = run(fresh([2]), obs[2:3])
-    _equal(_pick(said, slice(2, 3)), alone, "an episode depends on its batch", 1e-6)
+    _equal(shown, _arrays(run(fresh(everyone), obs, signals=True)), "a second run differs: not deterministic")
+    alone = _arrays(run(fresh([2]), obs[2:3], signals=True))
+    _equal(_pick(shown, slice(2, 3)), alone, "an episode depends on its batch", 1e-6)
     # no look-ahead: what is said up to a sample does not change with what comes after it
     half = samples // 2
     changed = obs.copy()
     changed[:, half:] = changed[:, :1]
-    other = run(fresh(everyone), changed)
+    other = _arrays(run(fresh(everyone), changed, signals=True))
     _equal(
-        _pick(said, slice(None), slice(half)),
+        _pick(shown, slice(None), slice(half)),
         _pick(other, slice(None), slice(half)),
         "what it says depends on later samples",
     )
@@ -234,23 +235,26 @@ def check_diagnoser(
     holes = obs.copy()
     holes[1, half, 0] = np.nan
     holes[1, half + 1] = np.nan
-    hurt = run(fresh(everyone), holes)
+    hurt = run(fresh(everyone), holes, signals=True)
     rest = [0, 2, 3]
-    _equal(_pick(said, rest), _pick(hurt, rest), "a NaN in one episode reaches another", 1e-6)
+    _equal(_pick(shown, rest), _pick(_arrays(hurt), rest), "a NaN in one episode reaches another", 1e-6)
     assert (hurt.mode[1] >= 0).all(), "a dropout loses the episode"
     assert hurt.theta is None or np.isfinite(hurt.theta[1]).all(), "a dropout leaves a NaN in the estimate"
 
 
-def _pick(said: Decisions, which: Sequence[int] | slice, samples: slice = slice(None)) -> Decisions:
-    chosen = {name: None if a is None else a[which][:, samples] for name, a in said._asdict().items()}
-    return Decisions(**chosen)  # type: ignore[arg-type]
+def _arrays(said: Decisions) -> dict[str, Array]:
+    """Everything that was said, by name, the method's own signals included."""
+    return {name: a for name, a in said._asdict().items() if isinstance(a, np.ndarray)} | (said.signals or {})
 
 
-def _equal(left: Decisions, right: Decisions, what: str, tolerance: float = 0.0) -> None:
-    for name, a, b in zip(Decisions._fields, left, right, strict=True):
-        if a is None or b is None:
-            assert a is b, f"{what} ({name})"
-            continue
+def _pick(arrays: dict[str, Array], which: Sequence[int] | slice, samples: slice = slice(None)) -> dict[str, Array]:
+    return {name: a[which][:, samples] for name, a in arrays.items()}
+
+
+def _equal(left: dict[str, Array], right: dict[str, Array], what: str, tolerance: float = 0.0) -> None:
+    assert left.keys() == right.keys(), f"{what}: {sorted(left)} against {sorted(right)}"
+    for name, a in left.items():
+        b = right[name]
         if a.dtype == bool or np.issubdtype(a.dtype, np.integer):
             assert np.array_equal(a, b), f"{what} ({name})"
         else:

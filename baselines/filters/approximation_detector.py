@@ -96,6 +96,11 @@ def sensor_sigma(plant: Plant) -> Array:
     return np.array([s.sigma for s in plant.outputs[:2]])
 
 
+def signals(detector: Detector) -> dict[str, Array]:
+    """What the estimator has to show: the approximated fault function, and the residuals beside their thresholds."""
+    return {"fault function": detector.fhat, "residual": detector.eps, "threshold": detector.threshold}
+
+
 @diagnoser("approximation_detector", "Online-approximation detector with noise margin")
 @diagnoser("approximation_detector_no_margin", "The same with the study's threshold, no noise margin", margin=False)
 def approximation_detector(plant: Plant, *, margin: bool = True) -> Diagnoser:
@@ -113,6 +118,6 @@ def approximation_detector(plant: Plant, *, margin: bool = True) -> Diagnoser:
 
     def update(before: Detector, obs: Array) -> tuple[Detector, Diagnosis]:
         detector = advance(before, model.read(plant, obs), sigma, margin)
-        return detector, Diagnosis(detector.alarm, np.zeros(len(obs), np.int64))
+        return detector, Diagnosis(detector.alarm, np.zeros(len(obs), np.int64), signals=signals(detector))
 
     return Diagnoser(start, update)

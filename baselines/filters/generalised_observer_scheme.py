@@ -138,7 +138,8 @@ def gos(plant: Plant, *, classes: tuple[int, ...] = (1, 2, 3, 4, 5), strict: boo
         bank = advance(state[1], detector, sample, classes)
         verdict = strict_verdict(bank, classes) if strict else tie_broken(bank, classes)
         mode = np.maximum(verdict, 0)
-        return (detector, bank), Diagnosis(bank.started, mode, declared_theta(bank, mode, classes))
+        shown = detection.signals(detector) | {"isolation residuals": bank.eps, "isolation thresholds": bank.threshold}
+        return (detector, bank), Diagnosis(bank.started, mode, declared_theta(bank, mode, classes), signals=shown)
 
     return Diagnoser(init, update)
 

@@ -75,6 +75,7 @@ def windowed_nis(plant: Plant, *, window: int = 50, confidence: float = 0.9999, 
             nis[:, k % window] = (nu[:, None, :] @ nominal.W @ nu[:, :, None])[:, 0, 0]
             exceeds = (nis.sum(axis=1) > limit) & (k >= window)
             over = np.where(exceeds, over + 1, 0)
-        return (k + 1, x, nis, over), Diagnosis(over >= alarm_after, np.zeros(n, np.int64))
+        shown = {"windowed NIS": nis.sum(axis=1), "limit": np.full(n, limit)}
+        return (k + 1, x, nis, over), Diagnosis(over >= alarm_after, np.zeros(n, np.int64), signals=shown)
 
     return Diagnoser(init, update)
