@@ -413,7 +413,7 @@ def test_robust_filter_is_unbiased_and_knows_its_variance(runs):
     at, H = trim_model(model, fault_inputs(model)), linear_output(model)
     steps, rng = 200, np.random.default_rng(6)
     b, d = arbitrary_signals(steps)
-    x0_std = np.array(find_diagnoser("robust_three_stage_ekf").build.__kwdefaults__["x0_std"])
+    x0_std = np.array(find_diagnoser("robust_three_stage_cdkf").build.__kwdefaults__["x0_std"])
     x = rng.standard_normal((runs, 11)) * x0_std
     s = robust_three_stage.start(runs, np.zeros(11), np.diag(x0_std**2), 3, 2)
     tile = [np.broadcast_to(M, (runs, *M.shape)) for M in (at.B, at.E)]

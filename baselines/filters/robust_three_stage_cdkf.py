@@ -1,4 +1,4 @@
-"""Robust three-stage central-difference Kalman filter, and its EKF counterpart.
+"""Robust three-stage central-difference Kalman filter.
 
 No prior and no random walk for fault and gust: their estimates, one sample late, are unbiased whatever they do, and as
 noisy as a difference of two measurements. See `fdi_gym.estimation.robust_three_stage`.
@@ -22,7 +22,6 @@ from fdi_gym.plant import Array, Plant
 
 
 @diagnoser("robust_three_stage_cdkf", "Robust three-stage central-difference Kalman filter (RThSCDKF)")
-@diagnoser("robust_three_stage_ekf", "Robust three-stage extended Kalman filter (RThSEKF)", rule="extended")
 def robust_three_stage_cdkf(
     plant: Plant,
     *,

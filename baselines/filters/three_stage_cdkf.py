@@ -1,4 +1,4 @@
-"""Three-stage central-difference Kalman filter, and its EKF counterpart: state, fault and gust in three stages.
+"""Three-stage central-difference Kalman filter: state, fault and gust in three stages.
 
 Fault and gust are random walks; the propagation is at the full estimates with the spread of the decoupled state. The
 algebra is in `fdi_gym.estimation.three_stage`, the propagation rules in `fdi_gym.estimation.propagation`.
@@ -36,7 +36,6 @@ def initial_covariance(plant: Plant, std: Sequence[float]) -> Array:
 
 
 @diagnoser("three_stage_cdkf", "Three-stage central-difference Kalman filter (ThSCDKF)")
-@diagnoser("three_stage_ekf", "Three-stage extended Kalman filter (ThSEKF)", rule="extended")
 def three_stage_cdkf(
     plant: Plant,
     *,
