@@ -239,3 +239,16 @@ def test_registered_plant_has_its_environment(motor):
     obs, _ = env.reset(seed=0)
     assert obs.shape == (3,)
     assert motor.env_id == "DCMotor-Faults-v0"
+
+
+def test_small_solves_are_lapacks():
+    from fdi_gym.estimation.kalman import solve
+
+    rng = np.random.default_rng(0)
+    for m, width in ((1, 1), (4, 4), (9, 11), (14, 2)):
+        S, B = rng.standard_normal((7, m, m)), rng.standard_normal((7, m, width))
+        assert solve(S, B) == pytest.approx(np.linalg.solve(S, B), rel=1e-9, abs=1e-9)
+        assert solve(S[0], B) == pytest.approx(np.linalg.solve(S[0], B), rel=1e-9, abs=1e-9)
+    permuted = np.array([[[0.0, 1.0], [1.0, 0.0]]])  # needs its pivot
+    assert solve(permuted, np.array([[[2.0], [3.0]]]))[0, :, 0].tolist() == [3.0, 2.0]
+    assert not np.isfinite(solve(np.zeros((1, 2, 2)), np.ones((1, 2, 1)))).any()

@@ -25,7 +25,7 @@ from fdi_gym.estimation.decision import (
     surface_candidate,
     with_logic,
 )
-from fdi_gym.estimation.kalman import T, right_divide, symmetric, times
+from fdi_gym.estimation.kalman import T, right_divide, solve, symmetric, times
 from fdi_gym.estimation.linear import LinearModel, linear_model
 from fdi_gym.plant import Array, Plant
 
@@ -99,12 +99,12 @@ def step(s: TwoStage, u: Array, y: Array, model: LinearModel, Q: Array, R: Array
     r = y - times(C, x)
     CPx = C @ Px
     S = CPx @ C.T + R
-    Kx = T(np.linalg.solve(S, CPx))
+    Kx = T(solve(S, CPx))
     x = x + times(Kx, r)
     Px = symmetric(Px - Kx @ CPx)
     HPz = H @ Pz_minus
     Sz = HPz @ T(H) + S
-    Kz = T(np.linalg.solve(Sz, HPz))
+    Kz = T(solve(Sz, HPz))
     nu = r - times(H, s.z)
     z = s.z + times(Kz, nu)
     Pz = symmetric(Pz_minus - Kz @ HPz)

@@ -24,14 +24,28 @@ def symmetric(P: Array) -> Array:
     return 0.5 * (P + T(P))
 
 
+def solve(S: Array, M: Array) -> Array:
+    """S^-1 M for stacks of small matrices: S (..., m, m), M (..., m, r). Not finite where S is singular."""
+    from fdi_gym import kernels
+
+    outer = S.shape[:-2] if S.shape[:-2] == M.shape[:-2] else np.broadcast_shapes(S.shape[:-2], M.shape[:-2])
+    left, right = (
+        np.ascontiguousarray(a if a.shape[:-2] == outer else np.broadcast_to(a, (*outer, *a.shape[-2:])), float)
+        for a in (S, M)
+    )
+    out = np.empty(right.shape)
+    kernels.solve(*(a.reshape(-1, *a.shape[-2:]) for a in (left, right, out)))
+    return out
+
+
 def right_divide(M: Array, S: Array) -> Array:
     """M S^-1 for symmetric S."""
-    return T(np.linalg.solve(S, T(M)))
+    return T(solve(S, T(M)))
 
 
 def quadratic(v: Array, S: Array) -> Array:
     """v' S^-1 v for each episode: (n,)."""
-    return np.einsum("ni,ni->n", v, np.linalg.solve(S, v[..., None])[..., 0])
+    return np.einsum("ni,ni->n", v, solve(S, v[..., None])[..., 0])
 
 
 class Updated(NamedTuple):
