@@ -135,7 +135,7 @@ def make_diagnoser(name: str, plant: Plant, *, scenarios: Sequence[Any] | None =
     Args:
         name: As in `find_diagnoser`.
         plant: The plant whose model it gets.
-        scenarios: The truth, for a clairvoyant one.
+        scenarios: The truth, one per episode; only a clairvoyant one gets it.
         tuning: Keyword arguments of its builder, over those of the name.
 
     Raises:

@@ -196,8 +196,7 @@ def diagnose(suite: Suite, plant: Plant, name: str, episodes: Sequence[int], rec
         NotApplicableError: The method cannot run on this plant.
     """
     scenarios = suite.scenarios(plant, episodes)
-    known = {"scenarios": scenarios} if find_diagnoser(name).clairvoyant else {}
-    diagnoser = make_diagnoser(name, plant, **known, **suite.settings.get(name, {}))
+    diagnoser = make_diagnoser(name, plant, scenarios=scenarios, **suite.settings.get(name, {}))
     record = simulate(plant, scenarios) if record is None else record
     start = time.perf_counter()
     said = run(diagnoser, record.obs)
@@ -249,9 +248,8 @@ def applicable(suite: Suite, plant: Plant, names: Sequence[str]) -> tuple[list[s
     able, reasons = [], {}
     scenarios = suite.scenarios(plant, [0])
     for name in names:
-        known = {"scenarios": scenarios} if find_diagnoser(name).clairvoyant else {}
         try:
-            make_diagnoser(name, plant, **known, **suite.settings.get(name, {}))
+            make_diagnoser(name, plant, scenarios=scenarios, **suite.settings.get(name, {}))
             able.append(name)
         except NotApplicableError as error:
             reasons[name] = str(error)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +140,15 @@ def write_rows(results: Path, suite: Suite, rows: dict[str, Row], timing: dict[s
 # Tables
 
 
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table with aligned columns."""
+    lines = [list(head), *[list(row) for row in rows]]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
+    text = ["| " + " | ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) + " |" for line in lines]
+    text.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
+    return "\n".join(text)
+
+
 def _percent(value: float, interval: list[float] | None = None) -> str:
     if interval is None:
         return f"{100 * value:.1f}"
@@ -188,11 +197,7 @@ def cells(row: Row, microseconds: float | None) -> list[str]:
 def table(rows: list[Row], timing: dict[str, float]) -> str:
     """The comparison table as Markdown, best per-sample balanced accuracy first."""
     ranked = sorted(rows, key=lambda row: (-row.metrics["per_sample"]["balanced_accuracy"], row.diagnoser))
-    lines = [list(COLUMNS), *(cells(row, timing.get(row.diagnoser)) for row in ranked)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(COLUMNS))]
-    text = ["| " + " | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) + " |" for line in lines]
-    text.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
-    return "\n".join(text)
+    return markdown(COLUMNS, [cells(row, timing.get(row.diagnoser)) for row in ranked])
 
 
 def confusion_table(row: Row, labels: list[str]) -> str:
@@ -200,14 +205,8 @@ def confusion_table(row: Row, labels: list[str]) -> str:
     counts = np.array(row.metrics["per_sample"]["confusion"], float)
     names = [*labels, "lost"] if counts[:, -1].any() else labels
     share = 100 * counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
-    lines = [
-        [row.diagnoser, *names],
-        *([label, *(f"{v:.1f}" for v in share[i, : len(names)])] for i, label in enumerate(labels)),
-    ]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    text = ["| " + " | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) + " |" for line in lines]
-    text.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
-    return "\n".join(text)
+    body = [[label, *(f"{v:.1f}" for v in share[i, : len(names)])] for i, label in enumerate(labels)]
+    return markdown([row.diagnoser, *names], body)
 
 
 INTRODUCTION = """# Leaderboards

@@ -59,9 +59,7 @@ class Canvas:
         said_t = np.array([j for j, _ in declared]) * plant.dt
         for axis in self.axes:
             axis.clear()
-            axis.spines[["top", "right"]].set_visible(False)
-            for first, stop in _spans(label > 0):
-                axis.axvspan(first * plant.dt, stop * plant.dt, color=SHADE, lw=0)
+            _dress(axis, label, plant.dt)
         top = self.axes[0]
         for j, signal in enumerate(plant.outputs):
             values = (record.obs[0, : k + 1, j] - signal.nominal) / signal.scale
@@ -104,6 +102,13 @@ def _spans(mask: Array) -> list[tuple[int, int]]:
     return [(max(int(a) - 1, 0), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
+def _dress(axis: Any, label: Array, dt: float) -> None:
+    """No box, and a shade where a fault acts."""
+    axis.spines[["top", "right"]].set_visible(False)
+    for first, stop in _spans(label > 0):
+        axis.axvspan(first * dt, stop * dt, color=SHADE, lw=0, zorder=0)
+
+
 def flight(plant: Plant, record: Record, said: dict[str, Any], i: int = 0, entries: Sequence[int] | None = None) -> Any:
     """A figure of one recorded flight with the diagnoses of several methods: labels, then the estimated entries.
 
@@ -135,9 +140,7 @@ def flight(plant: Plant, record: Record, said: dict[str, Any], i: int = 0, entri
                 axis.plot(t, decisions.theta[i, :length, j], color=colour, lw=0.9)
         axis.set_ylabel(f"{plant.estimated[j].name} {plant.estimated[j].unit}", fontsize=8)
     for axis in axes:
-        axis.spines[["top", "right"]].set_visible(False)
-        for first, stop in _spans(record.label[i, :length] > 0):
-            axis.axvspan(first * plant.dt, stop * plant.dt, color=SHADE, lw=0, zorder=0)
+        _dress(axis, record.label[i, :length], plant.dt)
     axes[0].legend(loc="upper left", fontsize=7, frameon=False, ncol=5, bbox_to_anchor=(0, 1.25))
     axes[-1].set_xlabel("time, s")
     return figure
@@ -166,8 +169,6 @@ def method_signals(plant: Plant, record: Record, said: Any, i: int = 0) -> Any:
     for axis, (name, values) in zip(axes, said.signals.items(), strict=True):
         axis.plot(t, values[i, :length].reshape(length, -1), lw=0.9)
         axis.set_ylabel(name, fontsize=8)
-        axis.spines[["top", "right"]].set_visible(False)
-        for first, stop in _spans(record.label[i, :length] > 0):
-            axis.axvspan(first * plant.dt, stop * plant.dt, color=SHADE, lw=0, zorder=0)
+        _dress(axis, record.label[i, :length], plant.dt)
     axes[-1].set_xlabel("time, s")
     return figure

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.filters.two_stage_kf import FORGETTING, forget, make_logic, prior
+from baselines.filters.two_stage_kf import aging, make_logic, prior
 from fdi_gym.diagnosis import Diagnoser, diagnoser
 from fdi_gym.estimation.decision import with_logic
 from fdi_gym.estimation.kalman import T, symmetric, times, update
@@ -76,14 +76,12 @@ def augmented_kf(
     release_after: int = 50,
 ) -> Diagnoser:
     """The augmented Kalman filter with a decision logic; arguments and errors as of `two_stage_kf`."""
-    if forgetting not in FORGETTING:
-        raise ValueError(f"unknown forgetting {forgetting!r}; there are {', '.join(FORGETTING)}")
+    aged = aging(plant, q_bias, forgetting, factor, a_min, a_max)
     model = linear_model(plant)
-    Qz = q_bias * np.eye(len(plant.theta))
     P_x, P_z = prior(plant)
 
     def advance(s: Augmented, u: Array, y: Array) -> Augmented:
-        return step(s, u, y, model, plant.Q, plant.R, forget(s.Pz, forgetting, factor, a_min, a_max) + Qz)
+        return step(s, u, y, model, plant.Q, plant.R, aged(s.Pz))
 
     logic = make_logic(plant, decision, threshold, release_after)
     return with_logic(plant, lambda n: start(n, len(plant.outputs), P_x, P_z), advance, logic)

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from baselines.filters.dual_ukf import dual_filter
-from baselines.filters.joint_ukf import N_XI, joint_filter
+from baselines.filters.dual_ukf import filter_of
 from fdi_gym.diagnosis import Diagnoser, diagnoser
 from fdi_gym.estimation.covariance_adaptation import BETA_0, INC_DUAL, INC_JOINT, element_grid
 from fdi_gym.estimation.effectiveness import Q_THETA, THRESHOLD
@@ -37,8 +36,6 @@ def caukf(
         NotApplicableError: The plant has no attitude.
         ValueError: Unknown form.
     """
-    if form not in ("joint", "dual"):
-        raise ValueError(f"unknown form {form!r}; there are joint, dual")
-    build, first = (joint_filter, N_XI) if form == "joint" else (dual_filter, 0)
+    build, first = filter_of(form)
     search = element_grid(first + np.arange(4), inc)
     return build(plant, search, beta_0=beta_0, q_theta=q_theta, sigma_r=sigma_r, threshold=threshold, n_pass=n_pass)

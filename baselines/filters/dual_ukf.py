@@ -8,11 +8,12 @@ E. A. Wan, R. van der Merwe, A. T. Nelson, NIPS 12, 2000 (dual estimation); tuni
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from baselines.filters.joint_ukf import N_SEEN, N_XI
+from baselines.filters.joint_ukf import N_SEEN, N_XI, joint_filter
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
 from fdi_gym.estimation.attitude import require_attitude, with_scalar
 from fdi_gym.estimation.covariance_adaptation import BETA_0, EPS_R, MEMORY, Search, Trial, adapt
@@ -131,6 +132,17 @@ def dual_filter(
         return DualUKF(s.k + 1, new.xi, new.P, f, P_f, sign, beta, adapted), decide(f, P_f, flag)
 
     return Diagnoser(init, update)
+
+
+def filter_of(form: str) -> tuple[Callable[..., Diagnoser], int]:
+    """The filter of a form, and where the effectiveness begins in the covariance that its adaptation raises.
+
+    Raises:
+        ValueError: Unknown form.
+    """
+    if form not in ("joint", "dual"):
+        raise ValueError(f"unknown form {form!r}; there are joint, dual")
+    return (joint_filter, N_XI) if form == "joint" else (dual_filter, 0)
 
 
 @diagnoser("dual_ukf", "Dual unscented Kalman filters of state and effectiveness")

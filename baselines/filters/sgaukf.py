@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from baselines.filters.dual_ukf import dual_filter
-from baselines.filters.joint_ukf import N_XI, joint_filter
+from baselines.filters.dual_ukf import filter_of
 from fdi_gym.diagnosis import Diagnoser, diagnoser
 from fdi_gym.estimation.covariance_adaptation import BETA_0, INC_DUAL, INC_JOINT, binary_grid
 from fdi_gym.estimation.effectiveness import Q_THETA, THRESHOLD
@@ -54,13 +53,13 @@ def sgaukf(
         NotApplicableError: The plant has no attitude.
         ValueError: Unknown form or parity.
     """
-    if form not in ("joint", "dual") or parity not in ("alternating", "odd"):
-        raise ValueError(f"form is joint or dual and parity alternating or odd, not {form!r} and {parity!r}")
+    build, first = filter_of(form)
+    if parity not in ("alternating", "odd"):
+        raise ValueError(f"unknown parity {parity!r}; there are alternating, odd")
 
     def choices(count: Array) -> Array:
         odd = (count % 2 == 0) | (parity == "odd")
         return np.where(odd[:, None, None], ODD, EVEN)
 
-    build, first = (joint_filter, N_XI) if form == "joint" else (dual_filter, 0)
     search = binary_grid(first + np.arange(4), inc, choices)
     return build(plant, search, beta_0=beta_0, q_theta=q_theta, sigma_r=sigma_r, threshold=threshold, n_pass=n_pass)

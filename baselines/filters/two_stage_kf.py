@@ -12,6 +12,7 @@ Equation numbers: A. Guven, C. Hajiyev, WSEAS Transactions on Signal Processing 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -83,6 +84,25 @@ def forget(Pz: Array, rule: str, factor: float, a_min: float, a_max: float) -> A
         else:
             a = np.maximum(a, np.minimum(a / factor, a_max))
         aged[capped] = (e * a[:, None, :]) @ T(e)
+    return aged
+
+
+def aging(
+    plant: Plant, q_bias: float, forgetting: str, factor: float, a_min: float, a_max: float
+) -> Callable[[Array], Array]:
+    """The time update Pz -> Pz- of a filter: forgetting, then a random walk of variance q_bias per step.
+
+    Raises:
+        ValueError: Unknown forgetting rule.
+    """
+    if forgetting not in FORGETTING:
+        raise ValueError(f"unknown forgetting {forgetting!r}; there are {', '.join(FORGETTING)}")
+    Qz = q_bias * np.eye(len(plant.theta))
+
+    def aged(Pz: Array) -> Array:
+        forgotten = forget(Pz, forgetting, factor, a_min, a_max)
+        return forgotten + Qz if q_bias else forgotten
+
     return aged
 
 
@@ -170,14 +190,12 @@ def two_stage_kf(
         NotApplicableError: The plant is nonlinear.
         ValueError: Unknown forgetting rule or decision.
     """
-    if forgetting not in FORGETTING:
-        raise ValueError(f"unknown forgetting {forgetting!r}; there are {', '.join(FORGETTING)}")
+    aged = aging(plant, q_bias, forgetting, factor, a_min, a_max)
     model = linear_model(plant)
-    Qz = q_bias * np.eye(len(plant.theta))
     P_x, P_z = prior(plant)
 
     def advance(s: TwoStage, u: Array, y: Array) -> TwoStage:
-        return step(s, u, y, model, plant.Q, plant.R, forget(s.Pz, forgetting, factor, a_min, a_max) + Qz)
+        return step(s, u, y, model, plant.Q, plant.R, aged(s.Pz))
 
     logic = make_logic(plant, decision, threshold, release_after)
     return with_logic(plant, lambda n: start(n, len(plant.outputs), P_x, P_z), advance, logic, structured)

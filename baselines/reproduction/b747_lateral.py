@@ -59,9 +59,8 @@ DETECTORS = {"(1, 0.9999)": (1, 0.9999), "(50, 0.9999)": (50, 0.9999), "(50, 0.9
 def watch(plant: Plant, scenarios: list[FaultScenario], method: str) -> tuple[Record, Decisions]:
     """Fly the scenarios and show them to a method."""
     name, settings = METHODS[method]
-    known = {"scenarios": scenarios} if name == "known_onset_oracle" else {}
     record = simulate(plant, scenarios)
-    return record, run(make_diagnoser(name, plant, **known, **settings), record.obs)
+    return record, run(make_diagnoser(name, plant, scenarios=scenarios, **settings), record.obs)
 
 
 def episodes(plant: Plant, process: str, count: int, first_seed: int, **options: Any) -> list[FaultScenario]:

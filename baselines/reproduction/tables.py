@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,9 @@ import msgspec
 from tqdm import tqdm
 
 from fdi_gym.evaluation import write_whole
+from fdi_gym.leaderboard import markdown
+
+__all__ = ["compared", "markdown", "pieces"]
 
 
 def pieces(folder: Path, jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]], workers: int = -1) -> dict[str, Any]:
@@ -28,15 +31,6 @@ def pieces(folder: Path, jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ..
         for _ in tqdm(parallel(tasks), total=len(missing), unit="piece"):
             pass
     return {name: msgspec.json.decode((folder / f"{name}.json").read_bytes()) for name in jobs}
-
-
-def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [list(head), *[list(row) for row in rows]]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
-    text = ["| " + " | ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) + " |" for line in lines]
-    text.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
-    return "\n".join(text)
 
 
 def compared(reference: float, found: float, error: float, digits: int = 3, tally: list[bool] | None = None) -> str:
