@@ -135,6 +135,9 @@ class Plant:
         perturb: Draws physical parameters at a level of mismatch: perturb(rng, level) -> dict, or None if it has none.
         reference: Maps a scenario to the exogenous reference rows (steps + 1, n_r).
         disturbance: Maps a scenario to the disturbance rows (steps + 1, n_d).
+        measured_disturbance: What the known signals say of the disturbance that is held over an interval:
+            measured_disturbance(t, before, now) -> (n, n_d), from its start t [s] and the known signals (n, n_known) at
+            its two ends. None where nothing is known of it.
         noise: Draws (w (steps, n_x), v (steps + 1, n_y)) from a Generator. Default: white, row by row, v before w.
         isolation_reward: (labels, labels): reward of declaring column while row is true. Default: 1 if right, else 0.
         identification_reward: Reward of an error (..., n). Default: minus the squares, scaled.
@@ -166,6 +169,7 @@ class Plant:
     perturb: Callable[[np.random.Generator, float], Mapping[str, Any]] | None = None
     reference: Callable[[FaultScenario], Array] = _no_rows
     disturbance: Callable[[FaultScenario], Array] | None = None
+    measured_disturbance: Callable[[float, Array, Array], Array] | None = None
     noise: Callable[[np.random.Generator, int], tuple[Array, Array]] | None = None
     isolation_reward: Array | None = None
     identification_reward: Callable[[Array], Array] | None = None
@@ -298,7 +302,7 @@ class Plant:
         rows = default if value is None else np.asarray(value, float)
         return np.ascontiguousarray(rows.reshape(math.prod(rows.shape[:-1]), rows.shape[-1]))  # also of zero width
 
-    def _rows_of(self, t: Any, x: Array, u: Array, theta: Any, d: Any, width: int) -> tuple[Array, ...]:
+    def _rows_of(self, t: Any, x: Array, u: Array, theta: Any, d: Any, p: Any, width: int) -> tuple[Array, ...]:
         """The arguments of a generic kernel from those of `propagate`, and an array for its output."""
         points = np.ascontiguousarray(x.reshape(-1, x.shape[-1]))
         return (
@@ -307,29 +311,34 @@ class Plant:
             self._rows(u, self.trim_command),
             self._rows(theta, self.nominal_theta),
             self._rows(d, np.zeros(len(self.disturbances))),
-            self.nominal_p[None, :],
+            self._rows(p, self.nominal_p),
             np.empty((points.shape[0], width)),
         )
 
-    def propagate(self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None) -> Array:
+    def propagate(
+        self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None, p: Array | None = None
+    ) -> Array:
         """The state one sample after x (..., n_x), without noise, u, theta and d held: the model's prediction.
 
-        u, theta and d may have fewer rows than x: row i of m then serves M/m consecutive points (sigma points of one
-        episode share its command). t [s] is a number or one per such group. theta and d default to nominal and none.
+        u, theta, d and p may have fewer rows than x: row i of m then serves M/m consecutive points (sigma points of one
+        episode share their command). t [s] is a number or one per such group. theta, d and the physical parameters p
+        default to nominal, none and the model's.
         """
         from fdi_gym import kernels
 
         x = np.asarray(x, float)
-        rows = self._rows_of(t, x, u, theta, d, len(self.states))
+        rows = self._rows_of(t, x, u, theta, d, p, len(self.states))
         kernels.propagate(self.addresses[0], self.addresses[4], self.dt, self.substeps, *rows)
         return rows[-1].reshape(x.shape)
 
-    def measure(self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None) -> Array:
+    def measure(
+        self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None, p: Array | None = None
+    ) -> Array:
         """The noise-free sensor values at x (..., n_x); arguments as in `propagate`, u held up to t."""
         from fdi_gym import kernels
 
         x = np.asarray(x, float)
-        rows = self._rows_of(t, x, u, theta, d, len(self.outputs))
+        rows = self._rows_of(t, x, u, theta, d, p, len(self.outputs))
         kernels.evaluate(self.addresses[1], *rows)
         return rows[-1].reshape(*x.shape[:-1], len(self.outputs))
 
@@ -338,7 +347,7 @@ class Plant:
         from fdi_gym import kernels
 
         x = np.asarray(x, float)
-        rows = self._rows_of(t, x, u, theta, d, len(self.states))
+        rows = self._rows_of(t, x, u, theta, d, None, len(self.states))
         kernels.evaluate(self.addresses[0], *rows)
         return rows[-1].reshape(x.shape)
 

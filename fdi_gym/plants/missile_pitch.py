@@ -234,6 +234,13 @@ def disturbance_rows(scenario: FaultScenario) -> np.ndarray:
     return np.tile([first - MACH, (last - first) / (scenario.steps * DT)], (scenario.steps + 1, 1))
 
 
+def measured_disturbance(t: float, before: np.ndarray, now: np.ndarray) -> np.ndarray:
+    """d of an interval from the Mach number, which is known at both ends."""
+    first, last = before[..., 2], now[..., 2]
+    rate = (last - first) / DT
+    return np.stack([first - MACH - rate * t, rate], axis=-1)
+
+
 def physical(changes: Mapping[str, Any]) -> np.ndarray:
     """p = rho_1..8; a shorter list leaves the rest exact."""
     rho = np.zeros(8)
@@ -407,6 +414,6 @@ def plant(*, noise_scale: float = 1.0, fault_scale: float = 1.0) -> Plant:
         labels=(Label("none", frozenset()), *(Label(name, frozenset({name})) for name in MODES)),
         processes=_processes(fault_scale),
         c0=np.zeros(6), q=prefilter(), physical=physical, perturb=perturb,
-        reference=reference_rows, disturbance=disturbance_rows,
+        reference=reference_rows, disturbance=disturbance_rows, measured_disturbance=measured_disturbance,
         noise=lambda rng, steps: bounded_noise(rng, steps, noise_scale), isolation_reward=reward,
     )  # fmt: skip
