@@ -70,7 +70,7 @@ _announced: set[str] = set()  # source files whose cold compilation has been ann
 
 
 @functools.cache
-def _cache_folder(source: str) -> Path | None:
+def cache_folder(source: str) -> Path | None:
     """The cache folder that belongs to these sources; None where there can be none."""
     if not Path(source).is_file():
         return None
@@ -86,7 +86,7 @@ def _cache_folder(source: str) -> Path | None:
 
 def _lazily(function: Callable[..., Any], signature: Any) -> Any:
     """The function as numba's dispatcher, cached in the folder of its sources; nothing is compiled yet."""
-    folder = _cache_folder(function.__code__.co_filename)
+    folder = cache_folder(function.__code__.co_filename)
     settings: Any = config
     before = settings.CACHE_DIR
     settings.CACHE_DIR = before if folder is None else str(folder)
@@ -102,7 +102,7 @@ def _compiled(dispatcher: Any) -> Any:
     """The dispatcher, compiled for its role's signature or loaded from the cache."""
     if not dispatcher.overloads:
         source = dispatcher.py_func.__code__.co_filename
-        folder = _cache_folder(source)
+        folder = cache_folder(source)
         if source not in _announced and not (folder and any(folder.rglob("*.nbi"))):
             print(f"fdi_gym: compiling {Path(source).stem} (once; kept in {folder})", file=sys.stderr, flush=True)
         _announced.add(source)
@@ -323,6 +323,64 @@ def solve(A, B, out):
                 for k in range(r + 1, m):
                     total -= a[r, k] * out[i, k, c]
                 out[i, r, c] = total / a[r, r]
+
+
+@_generic(void(float64[:, :, :, ::1], float64[:, :, ::1], M, M, float64[:, :, ::1], M))
+def box_minimum(G, g, low, high, m, value):
+    """value[i, h] = min of m' G m - 2 g' m over low[h] <= m <= high[h], for positive definite G[i, h]; m is where.
+
+    Exact: at the minimum some coordinates are free and the others at a bound. All such choices are tried.
+    """
+    n, sets, f = g.shape
+    a, b, at, where = np.empty((f, f)), np.empty(f), np.zeros(f, np.int64), np.empty(f, np.int64)
+    tried = np.empty(f)
+    choices = 3**f
+    for i in range(n):
+        for h in range(sets):
+            value[i, h] = np.inf
+            for choice in range(choices):
+                rest, free = choice, 0
+                for j in range(f):
+                    at[j], rest = rest % 3, rest // 3
+                    if at[j] == 0:
+                        where[free] = j
+                        free += 1
+                    else:
+                        tried[j] = low[h, j] if at[j] == 1 else high[h, j]
+                for r in range(free):
+                    b[r] = g[i, h, where[r]]
+                    for j in range(f):
+                        if at[j] != 0:
+                            b[r] -= G[i, h, where[r], j] * tried[j]
+                    for c in range(free):
+                        a[r, c] = G[i, h, where[r], where[c]]
+                for k in range(free):  # positive definite: no pivoting
+                    for r in range(k + 1, free):
+                        factor = a[r, k] / a[k, k]
+                        for c in range(k, free):
+                            a[r, c] -= factor * a[k, c]
+                        b[r] -= factor * b[k]
+                inside = True
+                for r in range(free - 1, -1, -1):
+                    for c in range(r + 1, free):
+                        b[r] -= a[r, c] * b[c]
+                    b[r] /= a[r, r]
+                    tried[where[r]] = b[r]
+                    # what rounding puts a hair outside is inside; the rest is another choice's business
+                    if b[r] < low[h, where[r]] - 1e-12 or b[r] > high[h, where[r]] + 1e-12:
+                        inside = False
+                if inside:
+                    total = 0.0
+                    for r in range(f):
+                        total -= 2.0 * g[i, h, r] * tried[r]
+                        for c in range(f):
+                            total += tried[r] * G[i, h, r, c] * tried[c]
+                    if total < value[i, h]:
+                        value[i, h] = total
+                        for j in range(f):
+                            m[i, h, j] = tried[j]
+                    if free == f:
+                        break  # the minimum of all m lies inside
 
 
 @_generic(

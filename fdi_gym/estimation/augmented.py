@@ -44,12 +44,21 @@ class Augmented(NamedTuple):
     R: Array  # (m, m)
     limit: Array  # (N,) largest variance that a walk may reach
     H: Array | None  # (m, N) where the sensors are linear in X and see nothing else
+    lines: tuple[Array, Array] | None = None  # offsets (r, p) and directions (r, p, f): z are then magnitudes along them
+
+    def deviation(self, z: Array) -> Array:
+        """The fault vector's deviation from healthy (n, ..., p) that z (n, ..., f) stands for; row i lies on line i % r."""
+        if self.lines is None:
+            return z
+        offset, direction = self.lines
+        grouped = z.reshape(-1, len(offset), int(np.prod(z.shape[1:-1])), z.shape[-1])
+        return (offset[:, None] + grouped @ T(direction)).reshape(*z.shape[:-1], offset.shape[-1])
 
     def _inputs(self, X: Array, known: Array | None) -> tuple[Array, Array]:
         """theta and d of points X (..., N)."""
         theta = np.empty((*X.shape[:-1], len(self.plant.theta)))
         theta[...] = self.plant.nominal_theta
-        theta[..., self.prior.inputs.entries] += X[..., self.z]
+        theta[..., self.prior.inputs.entries] += self.deviation(X[..., self.z])
         d = np.zeros((*X.shape[:-1], len(self.plant.disturbances)))
         if known is not None:
             d += known.reshape(len(known), *[1] * (X.ndim - 2), -1)
@@ -108,7 +117,9 @@ def _linear_sensors(model: Augmented) -> Array | None:
 
     def at(n: int) -> Interval:
         d = rng.standard_normal((n, n_d)) if plant.measured_disturbance is not None else None
-        return Interval(int(rng.integers(1, 100)), np.empty(0), plant.trim_command + rng.standard_normal((n, len(plant.commands))), d)
+        return Interval(
+            int(rng.integers(1, 100)), np.empty(0), plant.trim_command + rng.standard_normal((n, len(plant.commands))), d
+        )
 
     points = np.concatenate([np.zeros((1, N)), np.diag(model.scale)])
     values = model.h(points[None], at(1))[0]
@@ -169,5 +180,3 @@ def augmented(
         p.R, limit, None,
     )  # fmt: skip
     return model._replace(H=_linear_sensors(model))
-
-

@@ -7,7 +7,6 @@ returns (state, Decision).
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -61,37 +60,31 @@ def manifolds(plant: Plant) -> list[Manifolds]:
     ]
 
 
+def nearest_of(I: Array, Iz: Array, sets: Manifolds) -> tuple[Array, Array]:  # noqa: E741
+    """min over m in its box of q' I q - 2 q' Iz with q = offset + D m, the log likelihood ratio of a set, times -2.
+
+    I (n, p, p) information about the deviation from healthy, Iz (n, p) what it says. Returns (n, h) and m (n, h, f).
+    """
+    from fdi_gym import kernels
+
+    D, offset = sets.direction, sets.offset
+    Io = (I @ offset.T).swapaxes(1, 2)  # (n, h, p)
+    base = (Io * offset).sum(axis=2) - 2 * Iz @ offset.T
+    g = ((Iz[:, None, :] - Io)[:, :, None, :] @ D)[:, :, 0, :]  # (n, h, f)
+    G = np.swapaxes(D, 1, 2) @ I[:, None] @ D  # (n, h, f, f)
+    m, value = np.zeros_like(g), np.empty_like(base)
+    kernels.box_minimum(*(np.ascontiguousarray(a) for a in (G, g, sets.low, sets.high)), m, value)
+    return base + value, m
+
+
 def closest(z: Array, I: Array, sets: Manifolds) -> tuple[Array, Array]:  # noqa: E741
     """Distance of each estimate to each set: min over m in its box of (z - offset - D m)' I (z - offset - D m).
 
-    z (n, p), I = P^-1 (n, p, p). Returns (J (n, h), m (n, h, f)). Exact: the minimum of a convex quadratic over a box
-    lies where some coordinates are free and the others at a bound, and all such choices are tried.
+    z (n, p), I = P^-1 (n, p, p). Returns (J (n, h), m (n, h, f)).
     """
-    q = z[:, None, :] - sets.offset
-    Iq = q @ I  # (n, h, p)
-    base = (Iq * q).sum(axis=2)
-    g = (Iq[:, :, None, :] @ sets.direction)[:, :, 0, :]  # (n, h, f)
-    G = np.swapaxes(sets.direction, 1, 2) @ I[:, None] @ sets.direction  # (n, h, f, f)
-    f = g.shape[2]
-    if f == 1:
-        m = np.clip(g / G[..., 0], sets.low, sets.high)
-        return base - (2 * m * g - m * m * G[..., 0])[..., 0], m
-    J, best = np.full(base.shape, np.inf), np.zeros_like(g)
-    for choice in itertools.product((None, 0, 1), repeat=f):
-        free = [i for i, bound in enumerate(choice) if bound is None]
-        fixed = [i for i, bound in enumerate(choice) if bound is not None]
-        m = np.zeros_like(g)
-        for i in fixed:
-            m[..., i] = (sets.low, sets.high)[choice[i]][:, i]  # type: ignore[index]
-        if free:
-            right = g[..., free] - (G[..., free, :][..., fixed] @ m[..., fixed, None])[..., 0]
-            m[..., free] = np.linalg.solve(G[..., free, :][..., free], right[..., None])[..., 0]
-        # what rounding puts a hair outside is inside; the rest is another choice's business
-        inside = ((m >= sets.low - 1e-12) & (m <= sets.high + 1e-12)).all(axis=2)
-        value = base - 2 * (g * m).sum(axis=2) + (m[..., None, :] @ G @ m[..., None])[..., 0, 0]
-        better = inside & (value < J)
-        J, best = np.where(better, value, J), np.where(better[..., None], m, best)
-    return J, best
+    Iz = (I @ z[..., None])[..., 0]
+    value, m = nearest_of(I, Iz, sets)
+    return (Iz * z).sum(axis=1)[:, None] + value, m
 
 
 class Fits(NamedTuple):

@@ -37,6 +37,10 @@ class Prior(NamedTuple):
     inputs: FaultInputs  # where the fault vector z enters
     z_size: Array  # (p,) median size of a fault while it acts
     z_walk: Array  # (p,)
+    m_mean: Array  # (modes,) magnitude of each fault mode along its line, while it acts
+    m_std: Array  # (modes,)
+    m_walk: Array  # (modes,) its walk, while it acts
+    changes: float  # changes of the label per sample
     disturbances: Array  # (q,) the disturbances that occur and are not measured
     d0: Array  # (q,) their initial standard deviations
     d_walk: Array  # (q,)
@@ -79,6 +83,33 @@ def _model_error(plant: Plant, scenarios: list[FaultScenario], record: Record, v
     return dx, dy
 
 
+def _magnitudes(plant: Plant, z: Array, record: Record, block: int) -> tuple[Array, Array, Array]:
+    """Mean, standard deviation and walk of each mode's magnitude, over the samples where it acts (modes,)."""
+    count = len(plant.modes)
+    m = np.full((*z.shape[:2], count), np.nan)
+    for index, label in enumerate(plant.labels):
+        active = [i for i, mode in enumerate(plant.modes) if mode.name in label.modes]
+        if active:
+            mine = record.label == index
+            offset = np.sum([plant.modes[i].offset for i in active], axis=0)
+            D = np.transpose([plant.modes[i].direction for i in active])
+            values = (z[mine] - offset) @ np.linalg.pinv(D).T
+            for column, i in enumerate(active):
+                m[mine, i] = values[:, column]
+    mean, std, walk = np.zeros(count), np.zeros(count), np.zeros(count)
+    for i, mode in enumerate(plant.modes):
+        low, high = mode.reach
+        values = np.clip(m[..., i][np.isfinite(m[..., i])], low, high)
+        if values.size:
+            mean[i], std[i] = values.mean(), values.std()
+            steps = np.diff(m[..., i : i + 1], axis=1)
+            acting = np.isfinite(steps[..., 0])
+            walk[i] = np.sqrt(long_run(np.nan_to_num(steps), acting, block)[0, 0])
+        else:  # too rare to have been drawn: uniform within its reach
+            mean[i], std[i] = 0.5 * (low + high), (high - low) / 12**0.5
+    return mean, std, walk
+
+
 @functools.lru_cache(maxsize=16)
 def _prior(plant_id: str, version: int, options: str, process: str) -> Prior:
     plant = load_plant(plant_id, **json.loads(options))
@@ -110,6 +141,9 @@ def _prior(plant_id: str, version: int, options: str, process: str) -> Prior:
     z_walk = np.sqrt(np.diag(long_run(np.diff(z, axis=1), flown, block)))
     z_walk = np.where(z_walk > 0, z_walk, 0.02 * size)
 
+    mean, std, m_walk = _magnitudes(plant, z, faulty, block)
+    changes = float(((np.diff(faulty.label, axis=1) != 0) & flown).sum() / flown.sum())
+
     d = np.zeros((FLIGHTS, K + 1, len(plant.disturbances)))
     if plant.disturbance is not None and plant.measured_disturbance is None:
         for i, scenario in enumerate(healthy):
@@ -120,7 +154,7 @@ def _prior(plant_id: str, version: int, options: str, process: str) -> Prior:
     floor = 1e-3 * np.array([plant.disturbances[i].scale for i in which])
     d_walk = np.sqrt(np.diag(long_run(np.diff(d, axis=1), valid, block)) + floor**2 / K)
     d0 = np.sqrt((d[:, 0] ** 2).mean(axis=0) + floor**2)
-    return Prior(plant.trim_state, P0, Q, R, sensors, inputs, size, z_walk, which, d0, d_walk)
+    return Prior(plant.trim_state, P0, Q, R, sensors, inputs, size, z_walk, mean, std, m_walk, changes, which, d0, d_walk)
 
 
 def prior(plant: Plant, process: str = "standard") -> Prior:
