@@ -1,8 +1,10 @@
-"""From what a method holds against each label to an alarm and a declared label, at a calibrated rate of false alarms.
+"""From what a method holds against each label to an alarm and a declared label.
 
 A detector says after every sample how badly each label fits (`Evidence.cost`); a label is declared where it fits better
-than health by the thresholds of its fault modes. `decide` adds persistence and hysteresis; `fdi_gym.estimation.calibration` finds
-the thresholds. The statistics of this file serve any filter that estimates the fault vector:
+than health by the thresholds of its fault modes. `decide` adds persistence and hysteresis; the thresholds are found in
+`fdi_gym.estimation.calibration`.
+
+The statistics of this file serve any filter that estimates the fault vector:
 
 - "distance": gain in fit of the best faulty label, in the metric of the estimate's covariance;
 - "thresholds": the same in the metric of the typical fault sizes: fixed thresholds on the estimate;
