@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import inspect
 import os
 import platform
 import time
@@ -189,6 +190,16 @@ def write_whole(path: Path, content: bytes) -> None:
     part.replace(path)
 
 
+def settings_of(suite: Suite, name: str) -> dict[str, Any]:
+    """A diagnoser's tuning on a suite: its own settings, the suite's, and the fault process if it asks for one.
+
+    Which process will be met is known to a method as the plant is: it may learn from flights of its own seeds.
+    """
+    entry = find_diagnoser(name)
+    asks = "process" in inspect.signature(entry.build).parameters
+    return {**({"process": suite.scenario} if asks else {}), **entry.settings, **suite.settings.get(name, {})}
+
+
 def diagnose(suite: Suite, plant: Plant, name: str, episodes: Sequence[int], record: Any = None) -> Block:
     """Fly episodes of a suite, diagnose them and reduce them to outcomes.
 
@@ -196,7 +207,7 @@ def diagnose(suite: Suite, plant: Plant, name: str, episodes: Sequence[int], rec
         NotApplicableError: The method cannot run on this plant.
     """
     scenarios = suite.scenarios(plant, episodes)
-    diagnoser = make_diagnoser(name, plant, scenarios=scenarios, **suite.settings.get(name, {}))
+    diagnoser = make_diagnoser(name, plant, scenarios=scenarios, **settings_of(suite, name))
     record = simulate(plant, scenarios) if record is None else record
     start = time.perf_counter()
     said = run(diagnoser, record.obs)
@@ -249,7 +260,7 @@ def applicable(suite: Suite, plant: Plant, names: Sequence[str]) -> tuple[list[s
     scenarios = suite.scenarios(plant, [0])
     for name in names:
         try:
-            make_diagnoser(name, plant, scenarios=scenarios, **suite.settings.get(name, {}))
+            make_diagnoser(name, plant, scenarios=scenarios, **settings_of(suite, name))
             able.append(name)
         except NotApplicableError as error:
             reasons[name] = str(error)
@@ -296,7 +307,7 @@ def evaluate(
         entry = find_diagnoser(name)
         row = Row(
             suite=suite.name, suite_sha256=suite.sha256, diagnoser=name, summary=entry.summary,
-            settings={**entry.settings, **suite.settings.get(name, {})}, clairvoyant=entry.clairvoyant,
+            settings=settings_of(suite, name), clairvoyant=entry.clairvoyant,
             versions=versions(), command=command, outcomes=outcomes,
             metrics=summarise(outcomes, len(plant.labels), [s.name for s in plant.estimated], plant.dt),
         )  # fmt: skip

@@ -10,12 +10,11 @@ linear plant the three are the Kalman filter.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from fdi_gym.diagnosis import Diagnoser, diagnoser
-from fdi_gym.estimation.alarm import Estimate, watch
+from fdi_gym.estimation.alarm import Estimate, FaultFilter
 from fdi_gym.estimation.augmented import Augmented, augmented
-from fdi_gym.estimation.calibration import calibrated
+from fdi_gym.estimation.calibration import calibrated_filter
 from fdi_gym.estimation.gaussian import RULES, Gaussian, advance, start
 from fdi_gym.plant import Array, Plant
 
@@ -66,9 +65,6 @@ def augmented_ekf(
     def step(s: Gaussian, obs: Array) -> Gaussian:
         return advance(model, RULES[rule], s, obs, first_sample)
 
-    filter_of: Any = (lambda n: start(model, n), step, lambda s: estimate_of(model, s))
-    tuning = f"augmented {rule} {walk} {x0_std} {z0_std} {z_walk} {first_sample}"
-    return calibrated(
-        plant, lambda excess: watch(plant, *filter_of, decision, model.prior.z_size, excess), filter_of=filter_of,
-        process=process, source=__file__, what=f"{tuning} {decision}",
-    )  # fmt: skip
+    what = f"augmented {rule} {walk} {x0_std} {z0_std} {z_walk} {first_sample}"
+    filter = FaultFilter(lambda n: start(model, n), step, lambda s: estimate_of(model, s))
+    return calibrated_filter(plant, filter, decision, model.prior.z_size, process=process, source=__file__, what=what)

@@ -77,6 +77,14 @@ class Estimate(NamedTuple):
     S: Array  # (n, m, m) its covariance
 
 
+class FaultFilter(NamedTuple):
+    """A filter of the fault vector, batched over episodes."""
+
+    start: Callable[[int], Any]
+    step: Callable[[Any, Array], Any]  # (state, obs (n, n_obs)) -> state
+    read: Callable[[Any], Estimate]
+
+
 class Test(NamedTuple):
     """A statistic of the innovations: start(n, m) and step(state, estimate) -> (state, statistic (n,))."""
 
@@ -136,21 +144,12 @@ def gain(cost: Array, penalty: Array) -> Array:
     return ((cost[..., :1] - cost[..., 1:]) / penalty[1:]).max(axis=-1)
 
 
-def watch(
-    plant: Plant,
-    start: Callable[[int], Any],
-    step: Callable[[Any, Array], Any],
-    read: Callable[[Any], Estimate],
-    decision: str,
-    size: Array,
-    excess: Callable[[], Array],
-) -> Detector:
+def watch(plant: Plant, filter: FaultFilter, decision: str, size: Array, excess: Callable[[], Array]) -> Detector:
     """A detector from a filter of the fault vector.
 
     Args:
         plant: The plant.
-        start, step: The filter: start(n) gives its state, step(state, obs) the next one.
-        read: The estimate in a state; its entries are those of `plant.estimated`.
+        filter: The filter; the entries of its estimate are those of `plant.estimated`.
         decision: One of DECISIONS.
         size: Typical fault sizes (p,), the metric of "thresholds".
         excess: By how much the estimate's covariance is too small on healthy flights (p, p); asked for when first used.
@@ -166,13 +165,13 @@ def watch(
     test = TESTS[decision]() if decision in TESTS else None
 
     def first(n: int) -> Any:
-        s = start(n)
-        return s, test.start(n, read(s).nu.shape[1]) if test else np.zeros((n, 0))
+        s = filter.start(n)
+        return s, test.start(n, filter.read(s).nu.shape[1]) if test else np.zeros((n, 0))
 
     def advance(state: Any, obs: Array) -> tuple[Any, Evidence]:
         s, tested = state
-        s = step(s, obs)
-        e = read(s)
+        s = filter.step(s, obs)
+        e = filter.read(s)
         fits = fit(e.z, fixed if decision == "thresholds" else e.P + excess(), groups)
         cost = np.empty((len(obs), labels))
         cost[:, 0], cost[:, fits.labels] = fits.J_healthy, fits.J

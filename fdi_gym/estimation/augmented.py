@@ -170,13 +170,11 @@ def augmented(
     scale = np.concatenate([
         [s.scale for s in plant.states], p.z_size[:n_z], [plant.disturbances[i].scale for i in p.disturbances]
     ])  # fmt: skip
+    P0_x = p.P0 if x0_std is None else np.diag(np.square(x0_std))
+    P0 = np.asarray(scipy.linalg.block_diag(P0_x, np.diag(z0**2), np.diag(p.d0**2)))
+    Q = np.asarray(scipy.linalg.block_diag(p.Q, np.diag(steps**2), np.diag(p.d_walk**2)))
     limit = np.full(N, np.inf)
     limit[z] = np.maximum(WIDEST * p.z_size[:n_z], z0) ** 2
-    model = Augmented(
-        plant, p, x, z, d, scale,
-        np.concatenate([p.x0, np.zeros(n_z + n_d)]),
-        scipy.linalg.block_diag(p.P0 if x0_std is None else np.diag(np.square(x0_std)), np.diag(z0**2), np.diag(p.d0**2)),
-        scipy.linalg.block_diag(p.Q, np.diag(steps**2), np.diag(p.d_walk**2)),
-        p.R, limit, None,
-    )  # fmt: skip
+    X0 = np.concatenate([p.x0, np.zeros(n_z + n_d)])
+    model = Augmented(plant, p, x, z, d, scale, X0, P0, Q, p.R, limit, None)
     return model._replace(H=_linear_sensors(model))

@@ -23,12 +23,13 @@ from fdi_gym.diagnosis import Diagnoser
 from fdi_gym.estimation.alarm import (
     PERSISTENCE,
     Detector,
-    Estimate,
+    FaultFilter,
     Persistence,
     Thresholds,
     decide,
     gain,
     penalties,
+    watch,
 )
 from fdi_gym.estimation.prior import flights_of
 from fdi_gym.kernels import cache_folder
@@ -46,20 +47,14 @@ def _healthy_flights(plant: Plant, process: str) -> Record:
     return flights_of(plant, process, FIRST, int(np.clip(SAMPLES // steps, 20, 60)), False)[1]
 
 
-def excess_covariance(
-    plant: Plant,
-    process: str,
-    start: Callable[[int], Any],
-    step: Callable[[Any, Array], Any],
-    read: Callable[[Any], Estimate],
-) -> Array:
+def excess_covariance(plant: Plant, process: str, filter: FaultFilter) -> Array:
     """By how much the spread of a healthy estimate exceeds the filter's own covariance (p, p); zero if it does not."""
     record = _healthy_flights(plant, process)
     n, samples, _ = record.obs.shape
-    s, own, found, count = start(n), 0.0, 0.0, 0
+    s, own, found, count = filter.start(n), 0.0, 0.0, 0
     for k in range(samples):
-        s = step(s, record.obs[:, k])
-        e = read(s)
+        s = filter.step(s, record.obs[:, k])
+        e = filter.read(s)
         flown = (k <= record.length) & np.isfinite(e.z).all(axis=1)
         z = e.z[flown]
         own, found, count = own + e.P[flown].sum(axis=0), found + z.T @ z, count + len(z)
@@ -139,42 +134,49 @@ def once(plant: Plant, process: str, source: str, what: str, compute: Callable[[
     return _kept[key]
 
 
-def calibrated(
-    plant: Plant,
-    detector: Callable[[Callable[[], Array]], Detector] | Detector,
-    *,
-    process: str,
-    source: str,
-    what: str,
-    filter_of: tuple[Callable[[int], Any], Callable[[Any, Array], Any], Callable[[Any], Estimate]] | None = None,
-) -> Diagnoser:
+def calibrated(plant: Plant, detector: Detector, *, process: str, source: str, what: str) -> Diagnoser:
     """The diagnoser of a detector at its calibrated thresholds; the calibration is flown when it is first used.
 
     Args:
         plant: The plant.
-        detector: The detector; with `filter_of`, a function that makes it from the estimate's excess covariance.
+        detector: The detector.
         process: The fault process that will be met.
         source: The method's file.
         what: Its name and tuning.
-        filter_of: start, step and read of the filter behind the detector (see `fdi_gym.estimation.alarm.watch`).
 
     Raises:
         ValueError: Unknown process.
     """
     plant.process(process)
-    p = len(plant.estimated)
 
-    def excess() -> Array:
-        assert filter_of is not None
-        found = once(
-            plant, process, source, f"{what}: excess", lambda: excess_covariance(plant, process, *filter_of).tolist()
-        )
-        return np.array(found).reshape(p, p)
-
-    made = detector if isinstance(detector, Detector) else detector(functools.cache(excess))
-
+    @functools.cache
     def thresholds() -> Thresholds:
-        found = once(plant, process, source, what, lambda: thresholds_of(plant, process, made)._asdict())
+        found = once(plant, process, source, what, lambda: thresholds_of(plant, process, detector)._asdict())
         return Thresholds(tuple(found["modes"]), found["rise"])
 
-    return decide(plant, made, functools.cache(thresholds))
+    return decide(plant, detector, thresholds)
+
+
+def calibrated_filter(
+    plant: Plant, filter: FaultFilter, decision: str, size: Array, *, process: str, source: str, what: str
+) -> Diagnoser:
+    """The diagnoser of a filter of the fault vector, with a decision logic at its calibrated thresholds.
+
+    Args:
+        plant: The plant.
+        filter: The filter.
+        decision, size: As in `fdi_gym.estimation.alarm.watch`.
+        process, source, what: As in `calibrated`.
+
+    Raises:
+        ValueError: Unknown process or decision.
+    """
+    p = len(plant.estimated)
+
+    @functools.cache
+    def excess() -> Array:
+        found = once(plant, process, source, f"{what}: excess", lambda: excess_covariance(plant, process, filter).tolist())
+        return np.array(found).reshape(p, p)
+
+    detector = watch(plant, filter, decision, size, excess)
+    return calibrated(plant, detector, process=process, source=source, what=f"{what} {decision}")

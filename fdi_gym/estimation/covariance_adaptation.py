@@ -55,13 +55,14 @@ def adapt(search: Search, P: Array, count: Array, run: Run, n_pass: int, eps_r: 
     return trial
 
 
-def binary_grid(entries: Array, inc: float, choices: Callable[[Array], Array]) -> Search:
-    """Raise or do not raise: P_ii = min(P_ii + inc, CAP) on the chosen elements; the first best candidate is kept.
+def binary_grid(entries: Array, inc: float | Array, choices: Callable[[Array], Array], cap: float | Array = CAP) -> Search:
+    """Raise or do not raise: P_ii = min(P_ii + inc, cap) on the chosen elements; the first best candidate is kept.
 
     Args:
         entries: The diagonal elements (D,) that may be raised.
-        inc: The increment.
+        inc: The increment, one or one per element.
         choices: Maps the adapted steps so far (m,) to (m, c, D) bool: which entries each candidate raises.
+        cap: The largest variance that is given, one or one per element.
     """
 
     def search(P: Array, count: Array, run: Run) -> Trial:
@@ -69,7 +70,7 @@ def binary_grid(entries: Array, inc: float, choices: Callable[[Array], Array]) -
         m, c, _ = masks.shape
         tried = np.repeat(P[:, None], c, axis=1)
         diagonal = tried[:, :, entries, entries]
-        tried[:, :, entries, entries] = np.where(masks, np.minimum(diagonal + inc, CAP), diagonal)
+        tried[:, :, entries, entries] = np.where(masks, np.minimum(diagonal + inc, cap), diagonal)
         trial = run(np.repeat(np.arange(m), c), tried.reshape(m * c, *P.shape[1:]))
         best = np.argmin(_score(trial.v).reshape(m, c), axis=1)
         return _take(trial, np.arange(m) * c + best)
@@ -77,24 +78,33 @@ def binary_grid(entries: Array, inc: float, choices: Callable[[Array], Array]) -
     return search
 
 
-def element_grid(entries: Array, inc: float, factors: tuple[float, ...] = (0.0, 0.25, 0.5, 1.0)) -> Search:
+def element_grid(
+    entries: Array,
+    inc: float | Array,
+    factors: tuple[float, ...] = (0.0, 0.25, 0.5, 1.0),
+    cap: float | Array = CAP,
+) -> Search:
     """Element by element: each distinct element of the block tries increments and keeps the best before the next.
 
-    Row by row, diagonal elements by factor * inc, off-diagonal ones by half of it in both entries. A candidate that is
-    not positive definite, or whose raised diagonal element exceeds CAP, is skipped. The best of all is kept.
+    Row by row, diagonal elements by factor * inc, off-diagonal ones by half of it in both entries; the increment of an
+    off-diagonal element is the geometric mean of its two. A candidate that is not positive definite, or whose raised
+    diagonal element exceeds the cap, is skipped. The best of all is kept.
     """
-    pairs = list(itertools.combinations_with_replacement(entries, 2))
+    D = len(entries)
+    numbers = list(itertools.combinations_with_replacement(range(D), 2))
+    incs, caps = np.broadcast_to(inc, D), np.broadcast_to(cap, D)
 
     def search(P: Array, count: Array, run: Run) -> Trial:
         m, c = len(P), len(factors)
         current, kept = P, None
-        for i, j in pairs:
+        for a, b in numbers:
+            i, j = entries[a], entries[b]
             tried = np.repeat(current[:, None], c, axis=1)
-            step = inc * np.array(factors)
+            step = (incs[a] if a == b else np.sqrt(incs[a] * incs[b])) * np.array(factors)
             allowed = np.ones((m, c), bool)
             if i == j:
                 tried[:, :, i, i] += step
-                allowed[:, 1:] = tried[:, 1:, i, i] <= CAP
+                allowed[:, 1:] = tried[:, 1:, i, i] <= caps[a]
             else:
                 tried[:, :, i, j] += 0.5 * step
                 tried[:, :, j, i] += 0.5 * step

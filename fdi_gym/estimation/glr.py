@@ -124,5 +124,3 @@ def advance(test: Test, s: Ratio, obs: Array) -> Ratio:
         G, g = fade * G + weighed @ signature, fade * g + (weighed @ nu[:, None, :, None])[..., 0]
         M = M - K[:, None] @ signature
     return Ratio(s.k + 1, X + times(K, nu), symmetric(P - K @ T(cross)), M, G, g, known, nu, S)
-
-

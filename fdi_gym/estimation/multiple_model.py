@@ -148,9 +148,6 @@ def advance(b: Bank, s: Models, obs: Array) -> Models:
 
 def deviation(b: Bank, s: Models) -> Array:
     """Each model's fault vector (n, labels, p)."""
-    n, labels, _ = s.X.shape
     assert b.model.lines is not None
     offset, direction = b.model.lines
     return offset + (direction @ s.X[..., b.model.z, None])[..., 0]
-
-
