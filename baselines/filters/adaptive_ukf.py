@@ -22,6 +22,7 @@ from fdi_gym.estimation.gaussian import Gaussian, look, nis, predict, start, uns
 from fdi_gym.plant import Array, Plant
 
 SENSORS = 6  # of the innovations to which BETA_0 belongs
+WALK = 0.1  # of the standard deviation that follows the process's faults by itself
 
 
 class Adaptive(NamedTuple):
@@ -61,22 +62,8 @@ def search_of(grid: str, model: Augmented) -> Search:
     return binary_grid(entries, inc, lambda count: turns[count % 2], cap)
 
 
-@diagnoser("adaptive_ukf_full", "Augmented UKF, covariance adapted by binary grid search, for any plant", grid="full")
-@diagnoser("adaptive_ukf_simplified", "The same with the simplified grid", grid="simplified")
-@diagnoser("adaptive_ukf_elements", "The same, element by element", grid="elements")
-def adaptive_ukf(plant: Plant, *, grid: str, process: str = "standard", walk: float = 0.1) -> Diagnoser:
-    """The adaptive filter.
-
-    Args:
-        plant: Any plant whose estimated quantity enters additively and whose sensors have noise.
-        grid: "full", "simplified" or "elements".
-        process: The fault process that will be met; its declaration gives walks, model errors and thresholds.
-        walk: Factor on the standard deviation of the faults' random walk; small, since the search follows the jumps.
-
-    Raises:
-        NotApplicableError: No sensor has noise, or the fault does not enter additively.
-        ValueError: Unknown grid or process.
-    """
+def adaptive_filter(plant: Plant, grid: str, process: str = "standard", walk: float = WALK) -> tuple[Augmented, FaultFilter]:
+    """The filter without its decision, and its model; arguments and errors as of `adaptive_ukf`."""
     model = augmented(plant, process, walk=walk)
     search, beta_0 = search_of(grid, model), BETA_0 / SENSORS * len(model.R)
     r_inv = 1.0 / np.diag(model.R)
@@ -113,7 +100,25 @@ def adaptive_ukf(plant: Plant, *, grid: str, process: str = "standard", walk: fl
     def first(n: int) -> Adaptive:
         return Adaptive(start(model, n), np.zeros(n), np.zeros(n, np.int64))
 
-    return calibrated_filter(
-        plant, FaultFilter(first, step, read), "distance", model.prior.z_size, process=process, source=__file__,
-        what=f"adaptive ukf {grid} {walk}",
-    )  # fmt: skip
+    return model, FaultFilter(first, step, read)
+
+
+@diagnoser("adaptive_ukf_full", "Augmented UKF, covariance adapted by binary grid search, for any plant", grid="full")
+@diagnoser("adaptive_ukf_simplified", "The same with the simplified grid", grid="simplified")
+@diagnoser("adaptive_ukf_elements", "The same, element by element", grid="elements")
+def adaptive_ukf(plant: Plant, *, grid: str, process: str = "standard", walk: float = WALK) -> Diagnoser:
+    """The adaptive filter.
+
+    Args:
+        plant: Any plant whose estimated quantity enters additively and whose sensors have noise.
+        grid: "full", "simplified" or "elements".
+        process: The fault process that will be met; its declaration gives walks, model errors and thresholds.
+        walk: Factor on the standard deviation of the faults' random walk; small, since the search follows the jumps.
+
+    Raises:
+        NotApplicableError: No sensor has noise, or the fault does not enter additively.
+        ValueError: Unknown grid or process.
+    """
+    model, filter = adaptive_filter(plant, grid, process, walk)
+    what = f"adaptive ukf {grid} {walk}"
+    return calibrated_filter(plant, filter, "distance", model.prior.z_size, process=process, source=__file__, what=what)

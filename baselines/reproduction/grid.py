@@ -1,0 +1,186 @@
+"""The grid: every method on every plant, on `standard` and `hard`: `python -m baselines.reproduction.grid`.
+
+Runs what has no row yet, measures the consistency of the general filters, and writes leaderboards/grid.md and grid.json.
+Rows and finished blocks are kept, so a killed run goes on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import tyro
+
+from baselines.reproduction.consistency import FILTERS, measure
+from baselines.reproduction.tables import markdown, pieces
+from fdi_gym.diagnosis import diagnosers
+from fdi_gym.evaluation import Row, Suite, applicable, evaluate, load_suite
+from fdi_gym.leaderboard import read_row, row_path, write_rows
+
+KINDS = ("standard", "hard")
+# the filters of the paper that each plant was taken from
+PAPER = {
+    "b747": ("two_stage_kf", "friedland_kf", "augmented_kf", "two_stage_kf_exponential", "two_stage_kf_directional"),
+    "huav": ("three_stage_cdkf", "three_stage_ekf", "robust_three_stage_cdkf", "robust_three_stage_ekf", "ascdkf"),
+    "missile": ("approximation_detector", "gos", "gos_strict", "gos_two_class", "gos_two_class_strict"),
+    "cmg": ("caukf", "gaukf", "sgaukf", "sgaukf_odd", "dual_gaukf", "dual_sgaukf"),
+}
+INTRODUCTION = """# The grid
+
+Every method on every plant. Written by `python -m baselines.reproduction.grid` from the rows in `results/`. Balanced
+accuracy per sample in percent, with a 95 % bootstrap interval over the episodes; "-": not applicable, with the reason
+that the code gives below. Methods marked * know the truth. General methods need nothing but the plant's declaration.
+"""
+
+
+@dataclasses.dataclass
+class Arguments:
+    """What is run."""
+
+    plants: tuple[str, ...] = tuple(PAPER)
+    """Suite families."""
+    page_only: bool = False
+    """Run nothing: the page of the rows that are there."""
+    jobs: int = -1
+    """Worker processes; -1 for one per core."""
+    work: Path = Path("runs")
+    """Folder of the finished blocks."""
+    results: Path = Path("leaderboards/results")
+    """Folder of the rows."""
+    page: Path = Path("leaderboards/grid.md")
+    """The page; the figures of the consistency lie beside it in grid.json."""
+
+
+def consistency_piece(suite: Suite, name: str) -> dict[str, Any]:
+    """NIS and NEES of one filter on one suite's plant and process."""
+    return measure(suite.build(), suite.scenario, name)
+
+
+def run(arguments: Arguments) -> dict[str, Any]:
+    """Fill the grid: the missing rows, then the missing consistency figures."""
+    for kind in KINDS:
+        for family in arguments.plants:
+            suite = load_suite(f"{family}-{kind}")
+            missing = [n for n in diagnosers() if not row_path(arguments.results, suite.name, n).exists()]
+            names, _ = applicable(suite, suite.build(), missing)
+            for name in names:  # one after the other: each row is written as soon as it is there
+                command = f"fdi-gym evaluate {suite.name} --diagnosers {name}"
+                rows, timing = evaluate(suite, [name], work=arguments.work, jobs=arguments.jobs, command=command)
+                write_rows(arguments.results, suite, rows, timing)
+    suites = [load_suite(f"{family}-{kind}") for family in arguments.plants for kind in KINDS]
+    jobs: dict[str, Any] = {f"{s.name}.{name}": (consistency_piece, (s, name)) for s in suites for name in FILTERS}
+    return pieces(arguments.work / "consistency", jobs, arguments.jobs)
+
+
+def accuracy(row: Row) -> tuple[float, float, float]:
+    """Balanced accuracy per sample and its interval, percent."""
+    m = row.metrics["per_sample"]
+    low, high = m["balanced_accuracy_interval"]
+    return 100 * m["balanced_accuracy"], 100 * low, 100 * high
+
+
+def cell(row: Row | None) -> str:
+    """A figure of the grid."""
+    if row is None:
+        return "-"
+    value, low, high = accuracy(row)
+    return f"{value:.1f} [{low:.1f}, {high:.1f}]"
+
+
+def rows_of(results: Path, suite: str) -> dict[str, Row]:
+    """The rows of a suite."""
+    return {
+        row.diagnoser: row for path in sorted((results / suite).glob("*.json")) if path.name != "timing.json"
+        for row in [read_row(path)]
+    }  # fmt: skip
+
+
+def table(found: dict[str, dict[str, Row]]) -> str:
+    """One kind of process: methods on plants, those that run everywhere first, by their mean."""
+    names = {name for rows in found.values() for name in rows}
+
+    def order(name: str) -> tuple[int, float, str]:
+        mine = [accuracy(rows[name])[0] for rows in found.values() if name in rows]
+        return -len(mine), -sum(mine) / len(mine), name
+
+    entries = diagnosers()
+    head = ["method", *found]
+    body = []
+    for name in sorted(names, key=order):
+        star = " *" if name in entries and entries[name].clairvoyant else ""
+        body.append([name + star, *(cell(rows.get(name)) for rows in found.values())])
+    return markdown(head, body)
+
+
+def winners(found: dict[str, dict[str, Row]]) -> str:
+    """Which method wins where, and by how much the paper's own filter is beaten on its own plant."""
+    body = []
+    for suite, rows in found.items():
+        honest = {n: accuracy(r) for n, r in rows.items() if not r.clairvoyant}
+        paper = {n: honest[n] for n in PAPER[suite.split("-")[0]] if n in honest}
+        oracle = max((accuracy(r)[0] for r in rows.values() if r.clairvoyant), default=float("nan"))
+        best, own = max(honest, key=lambda n: honest[n][0]), max(paper, key=lambda n: paper[n][0])
+        apart = honest[best][1] > paper[own][2]
+        ahead = honest[best][0] - paper[own][0]
+        body.append([
+            suite, f"{best} {cell(rows[best])}", f"{own} {cell(rows[own])}",
+            "its own wins" if best == own else f"{ahead:.1f} points, intervals {'apart' if apart else 'overlap'}",
+            f"{oracle:.1f}",
+        ])  # fmt: skip
+    return markdown(["suite", "best method", "best filter of the plant's paper", "beaten by", "best oracle"], body)
+
+
+def reasons(suites: list[Suite]) -> str:
+    """The pairs without a row, with the code's reason."""
+    said: dict[tuple[str, str], list[str]] = {}
+    for suite in suites:
+        _, why = applicable(suite, suite.build(), list(diagnosers()))
+        for name, reason in why.items():
+            said.setdefault((suite.name.split("-")[0], reason), []).append(name)
+    body = [[plant, ", ".join(sorted(set(names))), reason] for (plant, reason), names in sorted(said.items())]
+    return markdown(["plant", "methods", "reason"], body)
+
+
+def consistency_table(found: dict[str, Any]) -> str:
+    """NIS and NEES of the general filters."""
+    body = []
+    for key, result in found.items():
+        suite, name = key.split(".", 1)
+        body.append([suite, name, *(
+            f"{result[w]['mean']:.2f}, {100 * result[w]['inside']:.0f} %: {result[w]['verdict']}" for w in ("NIS", "NEES")
+        )])  # fmt: skip
+    return markdown(["suite", "filter", "NIS", "NEES of the state"], body)
+
+
+def page(results: Path, consistency: dict[str, Any]) -> str:
+    """The whole page."""
+    parts = [INTRODUCTION]
+    for kind in KINDS:
+        found = {f"{family}-{kind}": rows_of(results, f"{family}-{kind}") for family in PAPER}
+        parts.append(f"## {kind}\n\n{table(found)}\n\n### Who wins\n\n{winners(found)}")
+    parts.append("## Not applicable\n\n" + reasons([load_suite(f"{family}-standard") for family in PAPER]))
+    parts.append(
+        "## Consistency\n\nHealthy flights. Mean per dimension (1 where the filter is as sure of itself as it may be), and "
+        "the share of samples on which the mean over 40 flights lies within its 95 % bounds. A filter that expects faults "
+        "to walk in at any time is conservative on flights that have none: that is the price of seeing them.\n\n"
+        + consistency_table(consistency)
+    )
+    return "\n\n".join(parts) + "\n"
+
+
+def main(arguments: Arguments) -> None:
+    """Fill the grid and write its page."""
+    figures = arguments.page.with_name("grid.json")
+    found = msgspec.json.decode(figures.read_bytes()) if figures.exists() else {}
+    if not arguments.page_only:
+        found |= run(arguments)
+        found = {key: found[key] for key in sorted(found)}
+        figures.write_bytes(msgspec.json.format(msgspec.json.encode(found), indent=2) + b"\n")
+    arguments.page.write_text(page(arguments.results, found))
+    print(arguments.page)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))
