@@ -1,0 +1,271 @@
+"""The general methods beyond the Gaussian filters: two-stage, interacting models, GLR, adaptive UKF, oracle."""
+
+import numpy as np
+import pytest
+from conftest import build
+from scipy.stats import multivariate_normal
+
+from baselines.filters.adaptive_ukf import adaptive_filter, every_subset
+from baselines.filters.joint_ukf import joint_ukf
+from baselines.filters.sgaukf import sgaukf
+from baselines.filters.two_stage_kf import step as two_stage_kf_step
+from baselines.reproduction.consistency import measure, verdict
+from fdi_gym.diagnosis import make_diagnoser, run
+from fdi_gym.estimation import gaussian, glr, multiple_model, two_stage
+from fdi_gym.estimation.augmented import augmented
+from fdi_gym.estimation.linear import linear_model
+from fdi_gym.estimation.prior import flights_of
+from fdi_gym.faults import draw
+from fdi_gym.simulation import no_noise, simulate
+
+FLIGHTS = 3
+
+
+@pytest.fixture
+def faulty(plant):
+    """A few faulty flights of validation seeds."""
+    return flights_of(plant, "standard", 400_000, FLIGHTS, True)[1]
+
+
+def samples(record, first=0, last=150):
+    return range(first, min(last, int(record.length.min())))
+
+
+def test_two_stage_is_the_augmented_extended_filter(plant, faulty):
+    """Mean and covariance of state, fault and disturbance, while both run through a fault-free and a faulty stretch."""
+    model = augmented(plant)
+    a, b = gaussian.start(model, FLIGHTS), two_stage.start(model, FLIGHTS)
+    rest = two_stage.others(model)
+    for k in samples(faulty):
+        obs = faulty.obs[:, k + 300] if faulty.obs.shape[1] > 500 else faulty.obs[:, k]
+        a, b = gaussian.advance(model, gaussian.extended, a, obs), two_stage.advance(model, b, obs)
+    scale = model.scale
+    assert np.abs((a.X[:, model.z] - b.z) / scale[model.z]).max() < 1e-6
+    assert np.abs((a.X[:, rest] - b.state()) / scale[rest]).max() < 1e-6
+    for mine, theirs, s in (
+        (a.P[:, model.z, model.z], b.Pz, scale[model.z]),
+        (a.P[:, rest][:, :, rest], b.covariance(), scale[rest]),
+        (a.S, b.S, np.sqrt(np.diag(model.R))),
+    ):
+        assert np.abs((mine - theirs) / np.outer(s, s)).max() < 1e-6
+    assert np.abs(a.nu - b.nu).max() < 1e-6 * np.abs(a.nu).max()
+
+
+def test_two_stage_equals_the_papers_on_the_linear_plant(b747):
+    """Same prior and random walk: the Keller-Darouach recursion of the 747 to rounding."""
+    from baselines.filters.two_stage_kf import start
+
+    record = flights_of(b747, "standard", 400_000, FLIGHTS, True)[1]
+    model = augmented(b747, x0_std=[0.1] * 4, z0_std=[1, 1, 2, 2], z_walk=[1e-3] * 4)
+    general = two_stage.start(model, FLIGHTS)
+    own = start(FLIGHTS, 4, 0.01 * np.eye(4), np.diag([1.0, 1.0, 4.0, 4.0]))
+    linear = linear_model(b747)
+    for k in range(400):
+        general = two_stage.advance(model, general, record.obs[:, k], first_sample=False)
+        if k > 0:
+            y, u, _ = b747.split(record.obs[:, k])
+            own = two_stage_kf_step(own, u, y, linear, b747.Q, b747.R, own.Pz + 1e-6 * np.eye(4))
+    assert np.abs(general.z - own.z).max() < 1e-9
+    assert np.abs(general.Pz - own.Pz).max() < 1e-9
+    assert np.abs(general.state() - own.state()).max() < 1e-9
+
+
+# -- interacting models
+
+
+def test_mixing_keeps_the_mixture(plant):
+    """Mean and second moment of state and disturbance, over all models, are those from before the mixing."""
+    bank = multiple_model.bank(plant)
+    record = flights_of(plant, "standard", 400_000, FLIGHTS, True)[1]
+    s = multiple_model.start(bank, FLIGHTS)
+    for k in range(30):
+        s = multiple_model.advance(bank, s, record.obs[:, k])
+    rng = np.random.default_rng(1)
+    mu = rng.dirichlet(np.ones(s.mu.shape[1]), FLIGHTS)
+    s = s._replace(mu=mu, X=s.X + rng.standard_normal(s.X.shape) * bank.model.scale)
+    c, X, P = multiple_model.mix(bank, s)
+    assert np.allclose(c.sum(axis=1), 1.0)
+    keep = two_stage.others(bank.model)
+
+    def moments(weight, x, p):
+        x, p = x[..., keep], p[..., keep, :][..., keep]
+        return (weight[..., None] * x).sum(1), (weight[..., None, None] * (p + x[..., :, None] * x[..., None, :])).sum(1)
+
+    for before, after in zip(moments(mu, s.X, s.P), moments(c, X, P), strict=True):
+        assert np.allclose(before, after, rtol=1e-9, atol=1e-12)
+    assert np.linalg.eigvalsh(P / np.outer(bank.model.scale, bank.model.scale)).min() > -1e-9
+
+
+def test_bank_without_changes_is_bayes_over_single_filters(b747):
+    """With no exchange between the models, the probabilities are those of independent filters' likelihoods."""
+    bank = multiple_model.bank(b747)
+    labels = len(b747.labels)
+    alone = bank._replace(transition=np.eye(labels))
+    record = flights_of(b747, "standard", 400_000, 1, True)[1]
+    s = multiple_model.start(alone, 1)._replace(mu=np.full((1, labels), 1 / labels))
+    linear, offset, direction = linear_model(b747), *bank.model.lines
+    filters = [(np.zeros(5), None) for _ in range(labels)]
+    log = np.zeros(labels)
+    for k in range(60):
+        s = multiple_model.advance(alone, s, record.obs[:, k])
+        y, u, _ = b747.split(record.obs[:, k])
+        for j in range(labels):
+            x, P = filters[j]
+            if P is None:
+                x = np.concatenate([bank.model.X0[:4], bank.m0[j]])
+                P = np.zeros((5, 5))
+                P[:4, :4], P[4:, 4:] = bank.model.P0[:4, :4], bank.M0[j]
+            else:
+                E = linear.E(u)[0]
+                F = np.eye(5)
+                F[:4, :4], F[:4, 4] = linear.A, E @ direction[j][:, 0]
+                x = F @ x + np.concatenate([linear.B @ u[0] + E @ offset[j], [0.0]])
+                P = F @ P @ F.T + bank.model.Q[j]
+            H = np.hstack([linear.C, np.zeros((4, 1))])
+            S = H @ P @ H.T + bank.model.R
+            log[j] += multivariate_normal.logpdf(y[0], H @ x, S)
+            K = P @ H.T @ np.linalg.inv(S)
+            filters[j] = (x + K @ (y[0] - H @ x), P - K @ H @ P)
+    expected = np.exp(log - log.max())
+    expected /= expected.sum()
+    assert np.allclose(s.mu[0], np.maximum(expected, multiple_model.LEAST), rtol=1e-6, atol=1e-9)
+    for j in range(labels):
+        assert np.allclose(s.X[0, j], filters[j][0], rtol=1e-7, atol=1e-8)
+
+
+# -- GLR
+
+
+def test_signature_predicts_the_innovations_of_a_fault(b747):
+    """Noise-free, from one of the tried onsets on: the innovations less the healthy ones are signature x fault."""
+    spacing, onset = 20, 199  # a slot that opens at sample 200 stands for a fault over [199, 200) and later
+    model = augmented(b747)
+    test = glr.Test(model, *glr.secants(b747, model.prior.z_size), onsets=8, spacing=spacing)
+    scenario = next(
+        s for s in (draw(b747.process("standard"), 2_400_000 + i) for i in range(99)) if s.faults and s.faults[0].kind == "LOE"
+    )
+    fault = scenario.faults[0]
+    scenario = scenario.replace(faults=[type(fault)(fault.mode, fault.kind, onset, fault.effects)])
+    record = simulate(b747, [scenario, scenario.without_faults()], [no_noise(b747, scenario.steps)] * 2)
+    s, truth = glr.start(test, 2), record.theta[0, -1]
+    for k in range(onset + 60):
+        s = glr.advance(test, s, record.obs[:, k])
+    slot = (onset + 60 - 1) // spacing - (onset + 1) // spacing
+    moved = s.g[0] - s.g[1]
+    assert np.abs(moved[slot] - s.G[0, slot] @ truth).max() < 1e-9 * np.abs(moved[slot]).max()
+    assert np.abs(np.delete(moved - s.G[0] @ truth, slot, axis=0)).max(axis=1).min() > 1e-3 * np.abs(moved[slot]).max()
+
+
+def test_secants_lie_on_the_side_of_the_modes():
+    low, high = glr.secants(build("CMGSatellite"), np.full(4, 0.5))
+    assert np.array_equal(low, [-0.5] * 4)
+    assert np.array_equal(high, [0.0] * 4)
+    low, high = glr.secants(build("MissilePitch"), np.ones(5))
+    assert np.array_equal(low, [-1, -1, 0, 0, 0])
+    assert np.array_equal(high, np.ones(5))
+
+
+def test_linearisation_equals_the_jacobian_where_the_model_is_linear_in_the_fault(b747):
+    model = augmented(b747)
+    X = np.random.default_rng(3).standard_normal((2, 4))
+    u = np.array([[1.0, -2.0], [0.5, 0.3]])
+    from fdi_gym.estimation.augmented import Interval
+
+    at = Interval(5, np.zeros((2, 4)), u, None)
+    found = glr.linearised(model, "f", X, at, *glr.secants(b747, model.prior.z_size))
+    _, F = model.jacobian("f", np.concatenate([X, np.zeros((2, 4))], axis=1), at)
+    assert np.allclose(found.A, F[:, :4, :4], atol=1e-9)
+    assert np.allclose(found.E, F[:, :4, 4:], atol=1e-9)
+
+
+# -- adaptive UKF
+
+
+def test_subsets():
+    assert np.array_equal(every_subset(2), [[False, False], [True, False], [False, True], [True, True]])
+    assert len(np.unique(every_subset(5), axis=0)) == 32
+
+
+@pytest.mark.parametrize("grid", ["full", "simplified", "elements"])
+def test_without_a_flag_it_is_the_augmented_ukf(plant, grid):
+    model, filter = adaptive_filter(plant, grid)
+    record = flights_of(plant, "standard", 400_000, FLIGHTS, False)[1]
+    s, plain = filter.start(FLIGHTS), gaussian.start(model, FLIGHTS)
+    for k in samples(record, last=60):
+        s = filter.step(s, record.obs[:, k])
+        plain = gaussian.advance(model, gaussian.unscented, plain, record.obs[:, k])
+    assert not s.adapted.any()
+    assert np.array_equal(s.filter.X, plain.X)
+    assert np.array_equal(s.filter.P, plain.P)
+
+
+def test_a_raised_variance_follows_a_jump_faster(b747):
+    """After a fault the adaptive filter has adapted, and its error is smaller than that of the same filter without."""
+    model, filter = adaptive_filter(b747, "full", walk=0.01)
+    scenarios, record = flights_of(b747, "standard", 400_000, 12, True)
+    s, plain = filter.start(12), gaussian.start(model, 12)
+    errors = []
+    for k in range(record.obs.shape[1]):
+        s = filter.step(s, record.obs[:, k])
+        plain = gaussian.advance(model, gaussian.unscented, plain, record.obs[:, k])
+        truth = record.theta[:, k]
+        errors.append([np.abs(e.X[:, model.z] - truth).mean(axis=1) for e in (s.filter, plain)])
+    mean = np.array(errors).mean(axis=0)
+    changed = np.array([bool(scenario.faults) for scenario in scenarios]) & (s.adapted > 0)
+    assert changed.sum() >= 3
+    assert mean[0, changed].mean() < 0.8 * mean[1, changed].mean()
+
+
+def test_general_forms_agree_with_the_satellites_own():
+    """Another state (q4 is one) and another residual: the same estimate within a few percent, adapted or not."""
+    plant = build("CMGSatellite")
+    scenarios = [s.replace(steps=3000) for s in flights_of(plant, "standard", 400_000, 2, False)[0]]
+    from fdi_gym.plants.cmg_satellite import loss
+
+    scenarios = [s.replace(faults=[loss(1, 0.5, 1000, 3000)]) for s in scenarios]
+    record = simulate(plant, scenarios)
+    model = augmented(plant, z0_std=[1e-2] * 4, z_walk=[1e-5] * 4)
+    s = gaussian.start(model, 2)
+    own = run(joint_ukf(plant), record.obs[:, :2000]).theta
+    for k in range(2000):
+        s = gaussian.advance(model, gaussian.unscented, s, record.obs[:, k])
+    jump = np.abs(own[:, -1] - 1.0).max()
+    assert np.abs(1.0 + s.X[:, model.z] - own[:, -1]).max() < 0.05 * jump
+    _, filter = adaptive_filter(plant, "simplified")
+    a = filter.start(2)
+    for k in range(3000):
+        a = filter.step(a, record.obs[:, k])
+    theirs = run(sgaukf(plant), record.obs).theta[:, -1]
+    assert np.abs(1.0 + a.filter.X[:, model.z] - record.theta[:, -1]).max() < 0.05
+    assert np.abs(1.0 + a.filter.X[:, model.z] - theirs).max() < 0.06
+
+
+# -- oracle and consistency
+
+
+def test_oracle_is_told_when_and_not_what(plant):
+    """Other faults at the same times, told of in place of the true ones, change nothing in what it says."""
+    scenarios, record = flights_of(plant, "standard", 400_000, 4, True)
+    told = make_diagnoser("told_onset_ekf", plant, scenarios=scenarios)
+    said = run(told, record.obs[:, :400])
+    acting = np.stack([plant.label_rows(s)[:400] > 0 for s in scenarios])
+    assert np.array_equal(said.alarm, acting)
+    single = [i for i, s in enumerate(scenarios) if len(s.faults) == 1]
+    if single:
+        other = next(mode.name for mode in plant.modes if mode.name != scenarios[single[0]].faults[0].mode)
+        lie = [
+            s if i != single[0] else s.replace(faults=[type(s.faults[0])(other, "", s.faults[0].onset, [], s.faults[0].end)])
+            for i, s in enumerate(scenarios)
+        ]
+        again = run(make_diagnoser("told_onset_ekf", plant, scenarios=lie), record.obs[:, :400])
+        assert np.array_equal(again.mode, said.mode)
+
+
+def test_consistency_of_the_kalman_filter(b747):
+    """Without a walk and without mismatch the augmented filter is the Kalman filter: NIS and NEES within their bounds."""
+    found = measure(b747, "standard", "augmented_ekf")
+    assert abs(found["NIS"]["mean"] - 1) < 0.05
+    assert found["NEES"]["mean"] < 1.05  # conservative: it allows for faults that never come
+    assert verdict(1.0, 0.95) == "consistent"
+    assert verdict(1.2, 0.5) == "optimistic"
+    assert verdict(0.8, 0.5) == "conservative"
