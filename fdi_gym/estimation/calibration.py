@@ -105,9 +105,10 @@ _kept: dict[str, Any] = {}
 
 
 def _source_of(plant: Plant) -> str:
-    """Digest of the file that declares the plant."""
-    module = importlib.import_module(plant_sources()[plant.id].builder.split(":")[0])
-    return hashlib.sha256(Path(module.__file__ or "").read_bytes()).hexdigest()[:16] if module.__file__ else ""
+    """Digest of the file that declares the plant; nothing for one that was never registered."""
+    source = plant_sources().get(plant.id)
+    file = importlib.import_module(source.builder.split(":")[0]).__file__ if source else None
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:16] if file else ""
 
 
 def once(plant: Plant, process: str, source: str, what: str, compute: Callable[[], Any]) -> Any:

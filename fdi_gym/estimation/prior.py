@@ -8,7 +8,6 @@ Nothing of a test flight is used.
 
 from __future__ import annotations
 
-import functools
 import json
 from typing import NamedTuple
 
@@ -17,7 +16,7 @@ import numpy as np
 from fdi_gym.diagnosis import NotApplicableError
 from fdi_gym.estimation.propagation import FaultInputs, fault_inputs
 from fdi_gym.faults import FaultScenario, draw
-from fdi_gym.plant import Array, Plant, load_plant
+from fdi_gym.plant import Array, Plant
 from fdi_gym.simulation import Record, simulate
 
 VALIDATION_SEED = 2_000_000
@@ -110,12 +109,10 @@ def _magnitudes(plant: Plant, z: Array, record: Record, block: int) -> tuple[Arr
     return mean, std, walk
 
 
-@functools.lru_cache(maxsize=16)
-def _prior(plant_id: str, version: int, options: str, process: str) -> Prior:
-    plant = load_plant(plant_id, **json.loads(options))
+def _prior(plant: Plant, process: str) -> Prior:
     sensors = np.flatnonzero([s.sigma > 0 for s in plant.outputs])
     if not sensors.size:
-        raise NotApplicableError(f"needs sensor noise; {plant_id} has none with {options}")
+        raise NotApplicableError(f"needs sensor noise; {plant.id} has none with {dict(plant.options)}")
     inputs = fault_inputs(plant)
     scale = np.array([s.scale for s in plant.states])
     scenarios, faulty = flights_of(plant, process, 0, FLIGHTS, True)
@@ -157,12 +154,20 @@ def _prior(plant_id: str, version: int, options: str, process: str) -> Prior:
     return Prior(plant.trim_state, P0, Q, R, sensors, inputs, size, z_walk, mean, std, m_walk, changes, which, d0, d_walk)
 
 
+_found: dict[str, Prior] = {}
+
+
 def prior(plant: Plant, process: str = "standard") -> Prior:
     """What the declaration of a plant and of one of its fault processes say; computed once per session.
+
+    A plant is what its id, version and options say: a copy with other fields has the same prior.
 
     Raises:
         NotApplicableError: No sensor has noise, or the fault vector does not enter additively.
         ValueError: Unknown process.
     """
     plant.process(process)
-    return _prior(plant.id, plant.version, json.dumps(dict(plant.options)), process)
+    key = json.dumps([plant.env_id, dict(plant.options), process], sort_keys=True)
+    if key not in _found:
+        _found[key] = _prior(plant, process)
+    return _found[key]
