@@ -38,7 +38,7 @@ from fdi_gym.plants import b747_lateral as b747_file
 from fdi_gym.simulation import simulate
 
 ALL_PLANTS = [*PLANTS, "DCMotor"]
-SMALL = 5e-4
+SMALL = 5e-3
 GENERAL = [name for name, entry in diagnosers().items() if "process" in inspect.signature(entry.build).parameters]
 FAMILY = ("ascdkf", "three_stage_cdkf", "three_stage_ekf", "robust_three_stage_cdkf", "robust_three_stage_ekf")
 
@@ -436,6 +436,10 @@ def test_nearest_point_of_a_box(f):
         assert m[i, j] == pytest.approx(best.x, abs=1e-6)
         at_bounds += (best.active_mask != 0).any()
     assert 0 < at_bounds < n * h or f > 2
+    Iz = z @ information[0]
+    one, many = nearest_of(information[:1], Iz, sets), nearest_of(np.tile(information[:1], (n, 1, 1)), Iz, sets)
+    assert np.array_equal(one[0], many[0])  # one information for all
+    assert np.array_equal(one[1], many[1])
 
 
 # -- calibration
