@@ -9,7 +9,10 @@ from pathlib import Path
 import pytest
 
 import fdi_gym
+from fdi_gym.estimation import calibration, unknown_inputs
+from fdi_gym.estimation.prior import flights_of
 from fdi_gym.plant import Plant, load_plant, plant_sources
+from fdi_gym.simulation import simulate
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "examples"))
@@ -34,3 +37,18 @@ def b747() -> Plant:
 @pytest.fixture
 def motor() -> Plant:
     return build("DCMotor")
+
+
+@pytest.fixture
+def short_calibrations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Calibrations on four flights of at most 100 samples, kept nowhere: for tests that don't count alarms."""
+
+    def short(plant, process, first, count, faults):
+        scenarios, _ = flights_of(plant, process, first, min(count, 4), faults)
+        scenarios = [s.replace(steps=min(s.steps, 100)) for s in scenarios]
+        return scenarios, simulate(plant, scenarios)
+
+    monkeypatch.setattr(calibration, "flights_of", short)
+    monkeypatch.setattr(unknown_inputs, "flights_of", short)
+    monkeypatch.setattr(calibration, "_kept", {})
+    monkeypatch.setattr(calibration, "cache_folder", lambda source: None)

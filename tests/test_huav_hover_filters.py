@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from baselines.filters import three_stage_cdkf
 from baselines.filters.flag_thresholds import TABLE, calibrate
 from baselines.filters.hypothesis_bank import transitions
 from baselines.filters.matched_oracle import steady_filter
@@ -26,6 +27,7 @@ from fdi_gym.plants import b747_lateral, huav_hover
 from fdi_gym.simulation import no_noise, simulate
 from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env
 
+PAPER, X0_STD = three_stage_cdkf.PAPER[huav_hover.ID], three_stage_cdkf.X0_STD
 P3, P4 = ("lon", "lat", "ped"), huav_hover.CHANNELS
 FILTERS = ("ascdkf", "three_stage_cdkf", "three_stage_ekf", "robust_three_stage_cdkf", "robust_three_stage_ekf")
 ALL = (*FILTERS, "hypothesis_bank", "matched_oracle")
@@ -252,7 +254,7 @@ def test_too_many_unknown_inputs_are_refused_at_construction():
     E = np.column_stack([at.E, 0.02 * 0.05 * np.eye(11)[2]])
     model = linear_plant(at.A, np.zeros((11, 4)), at.B, E, H, huav_hover.SIGMA_W, huav_hover.SIGMA_V)
     with pytest.raises(NotApplicableError, match="rank"):
-        build("robust_three_stage_ekf", model, thresholds=[1.0] * 4)
+        build("robust_three_stage_ekf", model, thresholds=[1.0] * 4, x0_std=X0_STD)
 
 
 def test_an_input_that_no_sensor_sees_is_refused_at_construction():
@@ -265,10 +267,12 @@ def test_an_input_that_no_sensor_sees_is_refused_at_construction():
 def test_errors_name_what_is_allowed(plant):
     with pytest.raises(NotApplicableError, match="col, lon, lat, ped"):
         build("three_stage_cdkf", plant, channels=("rudder",))
-    with pytest.raises(NotApplicableError, match="no calibrated thresholds"):
-        build("three_stage_cdkf", load_plant(huav_hover.ID, kappa=0.5))
-    with pytest.raises(NotApplicableError, match="no calibrated thresholds"):
-        build("three_stage_cdkf", load_plant(huav_hover.ID, K_B=0.5))
+    with pytest.raises(NotApplicableError, match="needs all fault channels of HUAVHover: col, lon, lat, ped"):
+        build("three_stage_cdkf", plant, channels=P3, decision="distance")
+    with pytest.raises(ValueError, match="unknown decision"):
+        build("three_stage_cdkf", plant, decision="sets")
+    with pytest.raises(ValueError, match="d_step needs one entry or 2"):
+        build("three_stage_cdkf", plant, d_step=[1.0] * 3)
     with pytest.raises(NotApplicableError, match="x0_std"):
         build("ascdkf", plant, x0_std=[1.0])
     with pytest.raises(ValueError, match="unknown rule"):
@@ -325,8 +329,8 @@ def test_three_stage_filter_is_the_augmented_one_on_the_linearised_helicopter(na
     b = 1e-4 * np.where(k > 100, [2, -1, 1, 2], 0) * np.sign(np.sin(k / 20 + np.arange(4)))  # the loop is open
     w, v = rng.standard_normal((500, 11)) * huav_hover.SIGMA_W, rng.standard_normal((501, 9)) * huav_hover.SIGMA_V
     y, _ = rows_flown(model, b, np.where(k > 50, [0.04, 0.03], 0), w, v)
-    (_, s, _), _ = last_state(build(name, model, thresholds=[1.0] * 4), shown(model, y))
-    (_, a, _), _ = last_state(build("ascdkf", model, thresholds=[1.0] * 4), shown(model, y))
+    (_, s, _), _ = last_state(build(name, model, thresholds=[1.0] * 4, **PAPER), shown(model, y))
+    (_, a, _), _ = last_state(build("ascdkf", model, thresholds=[1.0] * 4, **PAPER), shown(model, y))
     scale = np.sqrt(np.diagonal(a.P[0]))
     assert np.concatenate(s.estimates(), axis=1)[0] / scale == pytest.approx(a.x[0] / scale, rel=1e-9, abs=1e-9)
     assert s.covariance()[0] / np.outer(scale, scale) == pytest.approx(a.P[0] / np.outer(scale, scale), abs=1e-9)
@@ -375,9 +379,9 @@ def test_robust_filter_is_the_limit_of_the_optimal_one():
     rng = np.random.default_rng(5)
     w, v = rng.standard_normal((200, 11)) * huav_hover.SIGMA_W, rng.standard_normal((201, 9)) * huav_hover.SIGMA_V
     y, _ = rows_flown(model, 0.01 * np.ones((200, 3)), np.ones((200, 2)), w, v)
-    wide = {"b_step": 10.0, "d_step": 1e4, "b0_std": 10.0, "d0_std": 1e4, "thresholds": [1.0] * 3}
+    wide = {"x0_std": X0_STD, "b_step": 10.0, "d_step": 1e4, "b0_std": 10.0, "d0_std": 1e4, "thresholds": [1.0] * 3}
     (_, s, _), _ = last_state(build("three_stage_ekf", model, **wide), shown(model, y))
-    (_, r, _), _ = last_state(build("robust_three_stage_ekf", model, thresholds=[1.0] * 3), shown(model, y))
+    (_, r, _), _ = last_state(build("robust_three_stage_ekf", model, thresholds=[1.0] * 3, x0_std=X0_STD), shown(model, y))
     xhat, bhat, dhat = s.estimates()
     for optimal, robust, cov in ((xhat, r.x, r.P), (bhat, r.b, r.cov_b), (dhat, r.d, r.cov_d)):
         assert np.abs(optimal - robust)[0] / np.sqrt(np.diagonal(cov[0])) == pytest.approx(0, abs=2e-2)
@@ -397,7 +401,7 @@ def test_robust_filter_follows_any_fault_and_gust_exactly_without_noise(name):
     model = linearised_helicopter(channels=P3)
     b, d = arbitrary_signals(120)
     y, x = rows_flown(model, b, d, np.zeros((120, 11)), np.zeros((121, 9)))
-    diagnoser = build(name, model, thresholds=[1.0] * 3)
+    diagnoser = build(name, model, thresholds=[1.0] * 3, x0_std=X0_STD)
     state = diagnoser.init(1)
     for k, row in enumerate(shown(model, y)[0]):
         state, said = diagnoser.update(state, row[None])
@@ -413,7 +417,7 @@ def test_robust_filter_is_unbiased_and_knows_its_variance(runs):
     at, H = trim_model(model, fault_inputs(model)), linear_output(model)
     steps, rng = 200, np.random.default_rng(6)
     b, d = arbitrary_signals(steps)
-    x0_std = np.array(find_diagnoser("robust_three_stage_cdkf").build.__kwdefaults__["x0_std"])
+    x0_std = np.array(X0_STD)
     x = rng.standard_normal((runs, 11)) * x0_std
     s = robust_three_stage.start(runs, np.zeros(11), np.diag(x0_std**2), 3, 2)
     tile = [np.broadcast_to(M, (runs, *M.shape)) for M in (at.B, at.E)]

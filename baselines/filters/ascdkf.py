@@ -13,16 +13,11 @@ import numpy as np
 import scipy.linalg
 
 from baselines.filters.flag_thresholds import thresholds_for
-from baselines.filters.three_stage_cdkf import X0_STD, initial_covariance
+from baselines.filters.three_stage_cdkf import PAPER
 from fdi_gym.diagnosis import Diagnoser, diagnoser
-from fdi_gym.estimation.flags import with_flags
 from fdi_gym.estimation.kalman import T, right_divide, symmetric, times
-from fdi_gym.estimation.propagation import (
-    central_difference_moments,
-    central_difference_points,
-    fault_inputs,
-    linear_output,
-)
+from fdi_gym.estimation.propagation import central_difference_moments, central_difference_points
+from fdi_gym.estimation.unknown_inputs import judged, known_of
 from fdi_gym.plant import Array, Plant
 
 
@@ -38,38 +33,45 @@ def ascdkf(
     plant: Plant,
     *,
     channels: Sequence[str] | None = None,
-    x0_std: Sequence[float] = X0_STD,
-    b0_std: float = 2e-3,
-    d0_std: float = 0.5,
-    b_step: float = 7e-4,
-    d_step: float = 0.05,
+    x0_std: Sequence[float] | None = None,
+    b0_std: float | Sequence[float] | None = None,
+    d0_std: float | Sequence[float] | None = None,
+    b_step: float | Sequence[float] | None = None,
+    d_step: float | Sequence[float] | None = None,
     alpha: float = 0.2,
     thresholds: Sequence[float] | None = None,
+    decision: str | None = None,
+    process: str = "standard",
     h: float = 3**0.5,
 ) -> Diagnoser:
-    """The augmented filter with the flag logic.
+    """The augmented filter.
 
     Args:
         plant: A plant whose fault enters additively and whose sensors are linear.
         channels: The fault channels, for example ("lon", "lat", "ped"). Default: all.
         x0_std: Standard deviations of the initial state.
-        b0_std, d0_std: Of the initial fault [rad] and disturbance [m/s].
-        b_step, d_step: Standard deviations of their random walks per step.
+        b0_std, d0_std: Of the initial fault and disturbance, in the data sheet's units; one, or one per entry.
+        b_step, d_step: Standard deviations of their random walks per step, likewise.
         alpha: Smoothing of the flag logic.
-        thresholds: Of the flag logic, one per channel [rad]. Default: the calibrated table.
+        thresholds: Of the flag logic, one per channel. Default: the calibrated table, else calibrated when first used.
+        decision: "flags" or "distance". Default: flags where they can tell the plant's labels apart.
+        process: The fault process that will be met. Tuning that is None is the paper's on the helicopter, elsewhere what
+            this process says.
         h: Interval of the central differences, in standard deviations.
 
     Raises:
-        NotApplicableError: The plant is not of that kind, or no thresholds are known for this configuration.
+        NotApplicableError: The plant is not of that kind.
+        ValueError: Unknown decision or process, or a list of the wrong length.
     """
-    inputs, H = fault_inputs(plant, channels), linear_output(plant)
+    given = {"x0_std": x0_std, "b0_std": b0_std, "d0_std": d0_std, "b_step": b_step, "d_step": d_step}
+    known = known_of(plant, channels, process, given, PAPER.get(plant.id, {}))
+    inputs, sensors, H, _, _, Q, R, *_ = known
     n_x, p, q = len(plant.states), len(inputs.names), len(plant.disturbances)
     N = n_x + p + q
-    P0x = initial_covariance(plant, x0_std)
-    P0 = np.asarray(scipy.linalg.block_diag(P0x, b0_std**2 * np.eye(p), d0_std**2 * np.eye(q)))
-    Qa = scipy.linalg.block_diag(plant.Q, b_step**2 * np.eye(p), d_step**2 * np.eye(q))
+    P0 = np.asarray(scipy.linalg.block_diag(known.P0, known.P0b, known.P0d))
+    Qa = scipy.linalg.block_diag(Q, known.Qb, known.Qd)
     fault, dist = slice(n_x, n_x + p), slice(n_x + p, N)
-    x0 = np.concatenate([plant.trim_state, np.zeros(p + q)])
+    x0 = np.concatenate([known.x0, np.zeros(p + q)])
 
     def first(n: int) -> Augmented:
         return Augmented(np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1)))
@@ -82,12 +84,15 @@ def ascdkf(
         x, Pf, _ = central_difference_moments(points, h)
         P = Pf + Qa
         PHt = P[..., :n_x] @ H.T
-        C = H @ PHt[:, :n_x] + plant.R
+        C = H @ PHt[:, :n_x] + R
         K = right_divide(PHt, C)
-        return Augmented(x + times(K, y - times(H, x[:, :n_x])), symmetric(P - K @ T(PHt)))
+        return Augmented(x + times(K, y.take(sensors, axis=1) - times(H, x[:, :n_x])), symmetric(P - K @ T(PHt)))
 
     def read(s: Augmented) -> tuple[Array, Array]:
         return s.x[:, fault], s.P[:, fault, fault]
 
-    J = thresholds_for(plant, "ascdkf", inputs, thresholds)
-    return with_flags(plant, inputs, first, advance, read, alpha=alpha, thresholds=J)
+    return judged(
+        plant, inputs, first, advance, read, decision=decision, process=process, alpha=alpha,
+        thresholds=thresholds_for(plant, "ascdkf", inputs, thresholds), source=__file__,
+        what=f"ascdkf {channels} {given} {h}",
+    )  # fmt: skip

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from fdi_gym.diagnosis import Diagnoser, NotApplicableError
+from fdi_gym.diagnosis import Diagnoser
+from fdi_gym.estimation.flags import largest
 from fdi_gym.estimation.propagation import FaultInputs
 from fdi_gym.plant import Array, Plant
 from fdi_gym.simulation import simulate
@@ -81,27 +82,10 @@ def calibrate(
     process = plant.process("fault-free")
     scenarios = [process.sample(np.random.default_rng([s, 1])).replace(noise_seed=s + 1_000_000) for s in seeds]
     obs = simulate(plant, scenarios).obs
-    state = diagnoser.init(len(obs))
-    most = np.zeros_like(state[-1].s)
-    for k in range(obs.shape[1]):
-        state, _ = diagnoser.update(state, obs[:, k])
-        np.maximum(most, np.abs(state[-1].s), out=most)
-    return np.quantile(most, quantile, axis=0)
+    return np.quantile(largest(diagnoser, obs), quantile, axis=0)
 
 
-def thresholds_for(plant: Plant, name: str, inputs: FaultInputs, given: Sequence[float] | None) -> Sequence[float]:
-    """The thresholds that were given, else those of the table.
-
-    Raises:
-        NotApplicableError: Neither; the message says how to get them.
-    """
-    if given is not None:
-        return given
+def thresholds_for(plant: Plant, name: str, inputs: FaultInputs, given: Sequence[float] | None) -> Sequence[float] | None:
+    """The thresholds that were given, else those of the table; None where it has none."""
     rows: Any = TABLE.get((plant.id, inputs.names, tuple(plant.options.values())), {})
-    if name not in rows:
-        raise NotApplicableError(
-            f"no calibrated thresholds of {name} for {plant.id} with {dict(plant.options)} and the channels "
-            f"{', '.join(inputs.names)}: pass thresholds=, for instance from "
-            "baselines.filters.flag_thresholds.calibrate on the filter built with any thresholds"
-        )
-    return [MRAD * value for value in rows[name]]
+    return given if given is not None or name not in rows else [MRAD * value for value in rows[name]]

@@ -63,7 +63,7 @@ def manifolds(plant: Plant) -> list[Manifolds]:
 def nearest_of(I: Array, Iz: Array, sets: Manifolds) -> tuple[Array, Array]:  # noqa: E741
     """min over m in its box of q' I q - 2 q' Iz with q = offset + D m, the log likelihood ratio of a set, times -2.
 
-    I (n, p, p) information about the deviation from healthy, Iz (n, p) what it says. Returns (n, h) and m (n, h, f).
+    I (n or 1, p, p) information about the deviation from healthy, Iz (n, p) what it says. Returns (n, h) and m (n, h, f).
     """
     from fdi_gym import kernels
 
@@ -72,6 +72,7 @@ def nearest_of(I: Array, Iz: Array, sets: Manifolds) -> tuple[Array, Array]:  # 
     base = (Io * offset).sum(axis=2) - 2 * Iz @ offset.T
     g = ((Iz[:, None, :] - Io)[:, :, None, :] @ D)[:, :, 0, :]  # (n, h, f)
     G = np.swapaxes(D, 1, 2) @ I[:, None] @ D  # (n, h, f, f)
+    G = G if len(G) == len(g) else np.repeat(G, len(g), axis=0)  # the kernel does not repeat the only row of I
     m, value = np.zeros_like(g), np.empty_like(base)
     kernels.box_minimum(*(np.ascontiguousarray(a) for a in (G, g, sets.low, sets.high)), m, value)
     return base + value, m

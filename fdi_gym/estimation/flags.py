@@ -67,6 +67,12 @@ def label_of_flags(labels: Array, sets: Array, on: Array, severity: Array) -> Ar
     return labels[np.argmax(np.where(fits, weight, -1.0), axis=1)]
 
 
+def tells_apart(plant: Plant, inputs: FaultInputs) -> bool:
+    """Whether flags on these channels can say which fault it is: each mode moves one of them at most, no two the same."""
+    moved = np.array([np.add(np.abs(mode.offset), np.abs(mode.direction)) > 0 for mode in plant.modes])[:, inputs.estimated]
+    return bool((moved.sum(axis=1) <= 1).all() and (moved.sum(axis=0) <= 1).all())
+
+
 def with_flags(
     plant: Plant,
     inputs: FaultInputs,
@@ -75,7 +81,7 @@ def with_flags(
     read: Callable[[Any], tuple[Array, Array]],
     *,
     alpha: float,
-    thresholds: Sequence[float],
+    thresholds: Sequence[float] | Array | Callable[[], Sequence[float]],
 ) -> Diagnoser:
     """A diagnoser from a filter of the fault vector and the flag logic. Its state is (k, filter's state, Flags).
 
@@ -86,14 +92,13 @@ def with_flags(
         advance: advance(state, t, u, y) gives the next one, t [s] being where the interval that has just ended began.
         read: The fault vector (n, p) and its covariance (n, p, p), from the filter's state.
         alpha: Smoothing factor.
-        thresholds: One per channel, in the unit of the estimate.
+        thresholds: One per channel, in the unit of the estimate; or what gives them when the diagnoser is first used.
 
     Raises:
         ValueError: Not one threshold per channel.
     """
-    J = np.asarray(thresholds, float)
     p = len(inputs.names)
-    if J.shape != (p,):
+    if not callable(thresholds) and np.shape(thresholds) != (p,):
         raise ValueError(f"one threshold per channel ({', '.join(inputs.names)}) is needed, not {list(thresholds)}")
     labels, sets = label_sets(plant, inputs)
 
@@ -101,6 +106,7 @@ def with_flags(
         return 0, first(n), start(n, p)
 
     def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
+        J = np.asarray(thresholds() if callable(thresholds) else thresholds, float)
         k, s, flags = state
         y, u, _ = plant.split(obs)
         n = len(obs)
@@ -117,3 +123,20 @@ def with_flags(
         return (k + 1, s, flags), Diagnosis(np.any(flags.on, axis=1), label, theta, std)
 
     return Diagnoser(init, update)
+
+
+def largest(diagnoser: Diagnoser, obs: Array, length: Array | None = None) -> Array:
+    """The largest smoothed estimate |s_i| of each flight (n, p), for a diagnoser as `with_flags` gives it.
+
+    Args:
+        diagnoser: The diagnoser; its thresholds don't matter.
+        obs: Observations (n, samples, n_obs).
+        length: Last sample of each flight (n,). Default: all are whole.
+    """
+    state = diagnoser.init(len(obs))
+    most = np.zeros_like(state[-1].s)
+    for k in range(obs.shape[1]):
+        state, _ = diagnoser.update(state, obs[:, k])
+        size = np.abs(state[-1].s)
+        np.maximum(most, size if length is None else np.where((k <= length)[:, None], size, 0.0), out=most)
+    return most

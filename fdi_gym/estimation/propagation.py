@@ -54,20 +54,21 @@ def fault_inputs(plant: Plant, channels: Sequence[str] | None = None) -> FaultIn
     return FaultInputs(names, np.array([asked.index(n) for n in names]), np.array(found))
 
 
-def linear_output(plant: Plant) -> Array:
-    """H (n_y, n_x) of a plant with y = H x.
+def linear_output(plant: Plant, sensors: Array | None = None) -> Array:
+    """H (m, n_x) of a plant with y = H x, for these of its sensors (m,); all by default.
 
     Raises:
         NotApplicableError: The sensors are not linear in the state, or see the command, a fault or the disturbance.
     """
-    n_x = len(plant.states)
+    n_x, which = len(plant.states), np.arange(len(plant.outputs)) if sensors is None else sensors
     rng = np.random.default_rng(0)
-    H = (plant.measure(0.0, np.eye(n_x), plant.trim_command) - plant.measure(0.0, np.zeros(n_x), plant.trim_command)).T
+    HT = plant.measure(0.0, np.eye(n_x), plant.trim_command) - plant.measure(0.0, np.zeros(n_x), plant.trim_command)
+    H = HT.take(which, axis=1).T
     x = rng.standard_normal((8, n_x))
     u = plant.trim_command + rng.standard_normal((8, len(plant.commands)))
     theta = plant.nominal_theta + rng.standard_normal((8, len(plant.theta)))
     d = rng.standard_normal((8, len(plant.disturbances))) if plant.disturbances else None
-    if not np.allclose(plant.measure(0.0, x, u, theta, d), x @ H.T, rtol=1e-9, atol=1e-9):
+    if not np.allclose(plant.measure(0.0, x, u, theta, d)[:, which], x @ H.T, rtol=1e-9, atol=1e-9):
         raise NotApplicableError(f"needs sensors y = H x; those of {plant.id} are not")
     return H
 

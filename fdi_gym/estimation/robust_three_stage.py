@@ -108,17 +108,21 @@ class Existence(NamedTuple):
     std_d: Array  # (q,)
 
 
-def existence(plant: Plant, inputs: FaultInputs, H: Array, *, smallest: float = 1e-3, samples: int = 5000) -> Existence:
+def existence(
+    plant: Plant, inputs: FaultInputs, H: Array, R: Array | None = None, *, smallest: float = 1e-3, samples: int = 5000
+) -> Existence:
     """Rank and steady state of the robust filter for the plant linearised at trim.
 
     Args:
         plant: The plant.
         inputs: The fault channels.
         H: Its output matrix.
+        R: Covariance of these sensors. Default: the plant's.
         smallest: Singular values of H[B E] (unit columns) below this share of the largest count as zero: such an input
             moves the sensors within one sample by a thousandth of what the others do.
         samples: Length of the recursion to the steady state; it is left early where that is reached.
     """
+    R = plant.R if R is None else R
     at = trim_model(plant, inputs)
     F = H @ np.hstack([at.B, at.E])
     needed = F.shape[1]
@@ -143,8 +147,8 @@ def existence(plant: Plant, inputs: FaultInputs, H: Array, *, smallest: float = 
     for _ in range(samples):
         before = P
         f = Propagated(np.zeros((1, len(A))), (A @ P @ A.T)[None], A[None], None, at.B[None], at.E[None])
-        L = input_gain(f, H, plant.Q, plant.R)[0][0]
-        found = step(f, zero[None], H, plant.Q, plant.R)
+        L = input_gain(f, H, plant.Q, R)[0][0]
+        found = step(f, zero[None], H, plant.Q, R)
         P = found.P[0]
         size = np.abs(P).max()
         if np.abs(P - before).max() <= 1e-11 * size or not size < 1e12:  # steady, or growing without bound
@@ -155,13 +159,13 @@ def existence(plant: Plant, inputs: FaultInputs, H: Array, *, smallest: float = 
     return Existence(rank, needed, condition, radius, *std)
 
 
-def check_existence(plant: Plant, inputs: FaultInputs, H: Array) -> Existence:
+def check_existence(plant: Plant, inputs: FaultInputs, H: Array, R: Array | None = None) -> Existence:
     """The conditions at trim, if they hold.
 
     Raises:
         NotApplicableError: They do not; the message says which one and what was found.
     """
-    found = existence(plant, inputs, H)
+    found = existence(plant, inputs, H, R)
     names = ", ".join((*inputs.names, *(s.name for s in plant.disturbances)))
     if found.rank < found.needed:
         raise NotApplicableError(
