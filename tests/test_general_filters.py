@@ -237,7 +237,7 @@ def test_measured_disturbance_of_the_missile():
 def few_flights(monkeypatch):
     """Priors from four flights; none is kept."""
     monkeypatch.setattr(prior_file, "FLIGHTS", 4)
-    monkeypatch.setattr(prior_file, "_prior", prior_file._prior.__wrapped__)
+    monkeypatch.setattr(prior_file, "_found", {})
 
 
 @pytest.mark.parametrize(("plant_id", "process"), [*((p, "fault-free") for p in ALL_PLANTS), ("B747Lateral", "hard"),

@@ -141,9 +141,8 @@ def test_signature_predicts_the_innovations_of_a_fault(b747):
     spacing, onset = 20, 199  # a slot that opens at sample 200 stands for a fault over [199, 200) and later
     model = augmented(b747)
     test = glr.Test(model, *glr.secants(b747, model.prior.z_size), onsets=8, spacing=spacing)
-    scenario = next(
-        s for s in (draw(b747.process("standard"), 2_400_000 + i) for i in range(99)) if s.faults and s.faults[0].kind == "LOE"
-    )
+    drawn = (draw(b747.process("standard"), 2_400_000 + i) for i in range(99))
+    scenario = next(s for s in drawn if s.faults and s.faults[0].kind == "LOE")
     fault = scenario.faults[0]
     scenario = scenario.replace(faults=[type(fault)(fault.mode, fault.kind, onset, fault.effects)])
     record = simulate(b747, [scenario, scenario.without_faults()], [no_noise(b747, scenario.steps)] * 2)

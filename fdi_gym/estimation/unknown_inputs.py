@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi_gym.diagnosis import Diagnoser, NotApplicableError
-from fdi_gym.estimation.alarm import Estimate, watch
-from fdi_gym.estimation.calibration import FIRST, calibrated, once
+from fdi_gym.estimation.alarm import Estimate, FaultFilter
+from fdi_gym.estimation.calibration import FIRST, calibrated_filter, once
 from fdi_gym.estimation.flags import largest, tells_apart, with_flags
 from fdi_gym.estimation.prior import flights_of, prior
 from fdi_gym.estimation.propagation import FaultInputs, fault_inputs, linear_output
@@ -174,8 +174,7 @@ def judged(
         none = np.zeros((len(b), 0))
         return Estimate(b[:, order], P[:, order[:, None], order], none, none[:, :, None])
 
-    return calibrated(
-        plant,
-        lambda excess: watch(plant, start, step, estimate, "distance", np.ones(len(order)), excess),
-        filter_of=(start, step, estimate), process=process, source=source, what=f"{what} distance",
-    )  # fmt: skip
+    filter = FaultFilter(start, step, estimate)
+    return calibrated_filter(
+        plant, filter, "distance", np.ones(len(order)), process=process, source=source, what=f"{what} distance"
+    )
