@@ -101,6 +101,10 @@ def _no_rows(scenario: FaultScenario) -> Array:
     return np.zeros((scenario.steps + 1, 0))
 
 
+def _nothing(state: Array) -> Mapping[str, Array]:
+    return {}
+
+
 def _no_change(physical: Mapping[str, Any]) -> Array:
     if physical:
         raise ValueError(f"this plant has no physical parameters to change, but the scenario sets {', '.join(physical)}")
@@ -135,6 +139,8 @@ class Plant:
         perturb: Draws physical parameters at a level of mismatch: perturb(rng, level) -> dict, or None if it has none.
         reference: Maps a scenario to the exogenous reference rows (steps + 1, n_r).
         disturbance: Maps a scenario to the disturbance rows (steps + 1, n_d).
+        monitor: Maps states (..., n_x) to named quantities (...) that `info` reports beside the truth, such as the distance
+            to a singularity; diagnosers never see them.
         noise: Draws (w (steps, n_x), v (steps + 1, n_y)) from a Generator. Default: white, row by row, v before w.
         isolation_reward: (labels, labels): reward of declaring column while row is true. Default: 1 if right, else 0.
         identification_reward: Reward of an error (..., n). Default: minus the squares, scaled.
@@ -166,6 +172,7 @@ class Plant:
     perturb: Callable[[np.random.Generator, float], Mapping[str, Any]] | None = None
     reference: Callable[[FaultScenario], Array] = _no_rows
     disturbance: Callable[[FaultScenario], Array] | None = None
+    monitor: Callable[[Array], Mapping[str, Array]] = _nothing
     noise: Callable[[np.random.Generator, int], tuple[Array, Array]] | None = None
     isolation_reward: Array | None = None
     identification_reward: Callable[[Array], Array] | None = None

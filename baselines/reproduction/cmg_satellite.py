@@ -70,18 +70,17 @@ def plan(quick: bool) -> list[Piece]:
     table4 += [Piece("table4", "regulate", s, m, 0) for s in (45, 75) for m in ref.TABLE_4_SLEW if m != "SGAUKF-odd"]
     table4 += [Piece("table4", "slew", s, m, 0) for m, cells in ref.TABLE_4_SIGMA_R.items() for s in cells]
     table4 += [Piece("table4", g, s, "oracle", 0) for g in ("slew", "regulate") for s in (45, 75)]
-    bench = [Piece("bench", "slew", s, m, b) for s in (45, 55, 75) for m in (*FILTERS, "oracle") for b in blocks(3)]
-    bench += [Piece("bench", "slew", 45, "SGAUKF", b) for b in blocks(10) if b > 2]
-    counts = {("slew", 45): 3, ("slew", 75): 1, ("regulate", 55): 2}
+    bench = [Piece("bench", "slew", s, m, b) for s in (45, 55, 75) for m in (*FILTERS, "oracle") for b in blocks(4)]
+    counts = {("slew", 45): 4, ("slew", 75): 2, ("regulate", 55): 1}
     table5 = [Piece("table5", *key, m, b) for key, rows in ref.TABLE_5.items() for m in rows for b in blocks(counts[key])]
-    hard = [Piece("hard", "slew", 45, m, b) for m in ref.HARD for b in blocks(1 if m == "dual GAUKF" else 2)]
-    hard += [
-        Piece("hard", "slew", s, m, b, level)
-        for (s, level), rows in ref.HARD_SETTINGS.items() for m in rows for b in blocks(2 if s == 35 else 1)
-    ]  # fmt: skip
-    severity = [Piece("severity", "slew", 45, m, b, a) for a in SEVERITIES for m in SEVERITY_METHODS for b in blocks(2)]
-    severity += [Piece("severity", "regulate", 45, "oracle", b, a) for a in (0.1, 0.2, 0.5, 0.9) for b in blocks(2)]
-    return table4 + bench + table5 + hard + severity
+    table5 += [Piece("table5", "slew", 45, "CAUKF", b) for b in blocks(4)]
+    table5 += [Piece("table5", "slew", 75, "CAUKF", b) for b in blocks(2)]
+    table5 += [Piece("table5", "slew", 55, m, b) for m in ("CAUKF", "GAUKF", "SGAUKF") for b in blocks(2)]
+    hard = [Piece("hard", "slew", 45, m, 0) for m in ref.HARD]
+    hard += [Piece("hard", "slew", s, m, 0, level) for (s, level), rows in ref.HARD_SETTINGS.items() for m in rows]
+    severity = [Piece("severity", "slew", 45, m, 0, a) for a in SEVERITIES for m in SEVERITY_METHODS]
+    severity += [Piece("severity", "regulate", 45, "oracle", 0, a) for a in (0.1, 0.2, 0.5, 0.9)]
+    return table4 + bench + hard + table5 + severity
 
 
 # -- pieces that are not campaigns
