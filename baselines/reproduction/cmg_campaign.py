@@ -165,7 +165,7 @@ def table4_outcome(record: Record, said: Watched, i: int) -> dict[str, Any]:
     return {
         "pre": rmse(error[500:2000]), "faulty": rmse(error[2001:15000]), "post": rmse(error[15001 : K + 1]),
         "right": float((said.label[i, : K + 1] == record.label[i, : K + 1]).mean()),
-        "flags": int(said.flag[i].sum()), "sd": rmse(said.sd[i, 2001:15000]),
+        "flags": int(said.flag[i].sum()), "at_once": bool(said.flag[i, 15001]), "sd": rmse(said.sd[i, 2001:15000]),
         "steps": int(said.filter_steps[i]), "terminated": bool(record.terminated[i]),
     }  # fmt: skip
 
