@@ -30,8 +30,8 @@ METHODS = {
 }  # fmt: skip
 # what the oracle is told of the severities
 ALPHA = {"bench": (0.1, 0.9), "table5": (0.0, 1.0), "table4": (0.5, 0.9), "hard": (0.02, 0.4)}
-PER_BLOCK = {"bench": 5, "table5": 5, "severity": 4}  # episodes per fault label in a block
-HARD_BLOCK, TABLE_4_BLOCK = 60, 10
+PER_BLOCK = {"bench": 5, "table5": 3, "severity": 2}  # episodes per fault label in a block
+HARD_BLOCK, TABLE_4_BLOCK = 30, 10
 
 
 class Piece(NamedTuple):

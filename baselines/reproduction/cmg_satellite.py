@@ -59,24 +59,22 @@ def plan(quick: bool) -> list[Piece]:
     """The blocks of the page, the campaign of the source's three filters first."""
     blocks = (lambda n: range(1)) if quick else range
     grids = [Piece("bench", "slew", s, m, b) for s in (45, 55, 75) for m in GRIDS for b in blocks(4)]
-    grids += [Piece("table5", "slew", 45, m, b) for m in GRIDS for b in blocks(4)]
     table4 = [Piece("table4", "slew", s, m, 0) for s in (45, 55, 75) for m in ref.TABLE_4_SLEW]
     table4 += [Piece("table4", "regulate", s, m, 0) for s in (45, 75) for m in ref.TABLE_4_SLEW if m != "SGAUKF-odd"]
     table4 += [Piece("table4", "slew", s, m, 0) for m, cells in ref.TABLE_4_SIGMA_R.items() for s in cells]
     table4 += [Piece("table4", g, s, "oracle", 0) for g in ("slew", "regulate") for s in (45, 75)]
     table4 += [Piece("table4", g, 75, m, b) for g, m in SINGLE_FLIGHTS for b in blocks(4)]
-    bench = [Piece("bench", "slew", s, m, b) for s in (45, 55, 75) for m in ("MEKF", "CLAIR") for b in blocks(4)]
-    bench += [
-        Piece("bench", "slew", s, m, b) for s in (45, 55, 75) for m in ("UKF", "dual GAUKF", "oracle") for b in blocks(2)
-    ]
-    hard = [Piece("hard", "slew", 45, m, 0) for m in ref.HARD]
-    hard += [Piece("hard", "slew", s, m, 0, level) for (s, level), rows in ref.HARD_SETTINGS.items() for m in rows]
-    counts = {("slew", 45): 4, ("slew", 75): 1, ("regulate", 55): 1}
-    table5 = [Piece("table5", *key, m, b) for key, rows in ref.TABLE_5.items() for m in rows for b in blocks(counts[key])]
-    table5 += [Piece("table5", "slew", s, m, 0) for s in (55, 75) for m in GRIDS]
+    hard = [Piece("hard", "slew", 45, m, b) for m in ref.HARD for b in blocks(1 if m == "dual GAUKF" else 2)]
     severity = [Piece("severity", "slew", 45, m, 0, a) for a in SEVERITIES for m in SEVERITY_METHODS]
     severity += [Piece("severity", "regulate", 45, "oracle", 0, a) for a in (0.1, 0.2, 0.5, 0.9)]
-    return list(dict.fromkeys(grids + table4 + bench + hard + table5 + severity))
+    others = {"MEKF": 2, "CLAIR": 2, "dual GAUKF": 1, "UKF": 1, "oracle": 1}
+    bench = [Piece("bench", "slew", s, m, b) for s in (45, 55, 75) for m, n in others.items() for b in blocks(n)]
+    settings = [Piece("hard", "slew", s, m, 0, level) for (s, level), rows in ref.HARD_SETTINGS.items() for m in rows]
+    table5 = [Piece("table5", "slew", 45, m, 0) for m in GRIDS]
+    ranges = [Piece("table5", *key, m, 0) for key, rows in ref.TABLE_5.items() for m in rows]
+    ranges += [Piece("table5", "slew", s, m, 0) for s in (55, 75) for m in GRIDS]
+    ranges += [Piece("table5", "slew", 45, m, b) for b in blocks(3) for m in GRIDS]
+    return list(dict.fromkeys(grids + table5 + table4 + hard + severity + bench + settings + ranges))
 
 
 def is_campaign(p: Piece) -> bool:
