@@ -132,8 +132,8 @@ class FDIEnv(gym.Env):
     Episode: the plant flies whatever is diagnosed. It is `truncated` at the scenario's last sample and `terminated`
     where the plant leaves its declared envelope.
 
-    Info: the truth to which the next action will be compared: `label` (int), `target` and `theta` (arrays), `time` [s].
-    For training only; the evaluation never passes it on.
+    Info: the truth to which the next action will be compared: `label` (int), `target` and `theta` (arrays), `time` [s];
+    and what the plant's `monitor` says of the state (floats). For training only; the evaluation never passes it on.
 
     Args:
         plant: Plant id (set by the registration).
@@ -188,6 +188,7 @@ class FDIEnv(gym.Env):
         record = simulate(self.plant, [self.scenario])
         self._obs, self._target, self._theta = record.obs[0], record.target[0], record.theta[0]
         self._label: list[int] = record.label[0].tolist()
+        self._monitored = {name: a.tolist() for name, a in self.plant.monitor(record.state[0]).items()}
         self._length, self._terminated = int(record.length[0]), bool(record.terminated[0])
         self._record = record
         self._k, self._over, self._declared = 0, False, []
@@ -227,6 +228,7 @@ class FDIEnv(gym.Env):
             "target": self._target[k].copy(),
             "theta": self._theta[k].copy(),
             "time": k * self.plant.dt,
+            **{name: values[k] for name, values in self._monitored.items()},
         }
 
     def render(self) -> Array | None:
@@ -402,13 +404,14 @@ class FDIVectorEnv(VectorEnv):
             "target": self._record.target[i, k].copy(),
             "theta": self._record.theta[i, k].copy(),
             "time": float(k * self.plant.dt),
+            **{name: float(value) for name, value in self.plant.monitor(self._record.state[i, k]).items()},
         }
 
     def _infos(self, mask: Array) -> dict[str, Any]:
         """The infos of the masked environments, in Gymnasium's vector form."""
         assert self._record is not None
         found = {name: getattr(self._record, name)[self._slots, self._k] for name in ("label", "target", "theta")}
-        found["time"] = self._k * self.plant.dt
+        found |= {"time": self._k * self.plant.dt, **self.plant.monitor(self._record.state[self._slots, self._k])}
         for value in found.values():
             value[~mask] = 0
         return found | {f"_{name}": mask.copy() for name in found}

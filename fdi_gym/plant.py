@@ -101,6 +101,10 @@ def _no_rows(scenario: FaultScenario) -> Array:
     return np.zeros((scenario.steps + 1, 0))
 
 
+def _nothing(state: Array) -> Mapping[str, Array]:
+    return {}
+
+
 def _no_change(physical: Mapping[str, Any]) -> Array:
     if physical:
         raise ValueError(f"this plant has no physical parameters to change, but the scenario sets {', '.join(physical)}")
@@ -138,6 +142,8 @@ class Plant:
         measured_disturbance: What the known signals say of the disturbance that is held over an interval:
             measured_disturbance(t, before, now) -> (n, n_d), from its start t [s] and the known signals (n, n_known) at
             its two ends. None where nothing is known of it.
+        monitor: Maps states (..., n_x) to named quantities (...) that `info` reports beside the truth, such as the distance
+            to a singularity; diagnosers never see them.
         noise: Draws (w (steps, n_x), v (steps + 1, n_y)) from a Generator. Default: white, row by row, v before w.
         isolation_reward: (labels, labels): reward of declaring column while row is true. Default: 1 if right, else 0.
         identification_reward: Reward of an error (..., n). Default: minus the squares, scaled.
@@ -170,6 +176,7 @@ class Plant:
     reference: Callable[[FaultScenario], Array] = _no_rows
     disturbance: Callable[[FaultScenario], Array] | None = None
     measured_disturbance: Callable[[float, Array, Array], Array] | None = None
+    monitor: Callable[[Array], Mapping[str, Array]] = _nothing
     noise: Callable[[np.random.Generator, int], tuple[Array, Array]] | None = None
     isolation_reward: Array | None = None
     identification_reward: Callable[[Array], Array] | None = None

@@ -59,6 +59,8 @@ def _check_record(plant: Plant, name: str, scenarios: Sequence[FaultScenario], r
     _, u, _ = plant.split(record.obs)
     assert np.array_equal(u[:, 0], np.tile(plant.trim_command, (len(u), 1))), f"{name}: u_-1 is the trim command"
     assert np.array_equal(record.target, plant.estimate_target(record.theta, u)), f"{name}: target is not that of theta"
+    for quantity, values in plant.monitor(record.state).items():
+        assert values.shape == record.label.shape, f"{name}: the monitored {quantity} is not one number per sample"
     for i, scenario in enumerate(scenarios):
         rows = plant.label_rows(scenario)[: record.length[i] + 1]
         assert np.array_equal(record.label[i, : len(rows)], rows), f"{name}: labels of episode {i}"

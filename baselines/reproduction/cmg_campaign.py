@@ -30,8 +30,8 @@ METHODS = {
 }  # fmt: skip
 # what the oracle is told of the severities
 ALPHA = {"bench": (0.1, 0.9), "table5": (0.0, 1.0), "table4": (0.5, 0.9), "hard": (0.02, 0.4)}
-PER_BLOCK = {"bench": 2, "table5": 1, "severity": 2}  # episodes per fault label in a block
-HARD_BLOCK, TABLE_4_BLOCK = 30, 4
+PER_BLOCK = {"bench": 5, "table5": 3, "severity": 2}  # episodes per fault label in a block
+HARD_BLOCK, TABLE_4_BLOCK = 30, 10
 
 
 class Piece(NamedTuple):
@@ -165,7 +165,7 @@ def table4_outcome(record: Record, said: Watched, i: int) -> dict[str, Any]:
     return {
         "pre": rmse(error[500:2000]), "faulty": rmse(error[2001:15000]), "post": rmse(error[15001 : K + 1]),
         "right": float((said.label[i, : K + 1] == record.label[i, : K + 1]).mean()),
-        "flags": int(said.flag[i].sum()), "sd": rmse(said.sd[i, 2001:15000]),
+        "flags": int(said.flag[i].sum()), "at_once": bool(said.flag[i, 15001]), "sd": rmse(said.sd[i, 2001:15000]),
         "steps": int(said.filter_steps[i]), "terminated": bool(record.terminated[i]),
     }  # fmt: skip
 

@@ -17,24 +17,16 @@ import tyro
 from baselines.filters.cramer_rao_oracle import Q_FLOOR, bound_step, first_covariance, opened
 from baselines.reproduction import cmg_reference as ref
 from baselines.reproduction.cmg_campaign import Piece, campaign, scenarios_of, watch
-from baselines.reproduction.cmg_tables import (
-    SEVERITIES,
-    SEVERITY_METHODS,
-    Results,
-    average,
-    percent,
-    reference_tables,
-    right,
-    source_tables,
-    wilson,
-)
+from baselines.reproduction.cmg_monte_carlo import GRIDS, campaign_tables
+from baselines.reproduction.cmg_source import source_tables
+from baselines.reproduction.cmg_statistics import Results, average, percent, right, wilson
+from baselines.reproduction.cmg_tables import SEVERITIES, SEVERITY_METHODS, SINGLE_FLIGHTS, reference_tables
 from baselines.reproduction.tables import markdown, pieces
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
 from fdi_gym.simulation import simulate
 
-FILTERS = ("UKF", "CAUKF", "GAUKF", "SGAUKF", "dual GAUKF", "MEKF", "CLAIR")
 AFTER = (100, 300, 1000, 3000)  # samples after the onset at which the bound is read
 INTRODUCTION = """# Satellite with four CMGs: reference figures, measured again
 
@@ -64,24 +56,30 @@ class Arguments:
 
 
 def plan(quick: bool) -> list[Piece]:
-    """The blocks of the page."""
+    """The blocks of the page, the campaign of the source's three filters first."""
     blocks = (lambda n: range(1)) if quick else range
+    grids = [Piece("bench", "slew", s, m, b) for s in (45, 55, 75) for m in GRIDS for b in blocks(4)]
     table4 = [Piece("table4", "slew", s, m, 0) for s in (45, 55, 75) for m in ref.TABLE_4_SLEW]
     table4 += [Piece("table4", "regulate", s, m, 0) for s in (45, 75) for m in ref.TABLE_4_SLEW if m != "SGAUKF-odd"]
     table4 += [Piece("table4", "slew", s, m, 0) for m, cells in ref.TABLE_4_SIGMA_R.items() for s in cells]
     table4 += [Piece("table4", g, s, "oracle", 0) for g in ("slew", "regulate") for s in (45, 75)]
-    bench = [Piece("bench", "slew", s, m, b) for s in (45, 55, 75) for m in (*FILTERS, "oracle") for b in blocks(3)]
-    bench += [Piece("bench", "slew", 45, "SGAUKF", b) for b in blocks(10) if b > 2]
-    counts = {("slew", 45): 3, ("slew", 75): 1, ("regulate", 55): 2}
-    table5 = [Piece("table5", *key, m, b) for key, rows in ref.TABLE_5.items() for m in rows for b in blocks(counts[key])]
+    table4 += [Piece("table4", g, 75, m, b) for g, m in SINGLE_FLIGHTS for b in blocks(4)]
     hard = [Piece("hard", "slew", 45, m, b) for m in ref.HARD for b in blocks(1 if m == "dual GAUKF" else 2)]
-    hard += [
-        Piece("hard", "slew", s, m, b, level)
-        for (s, level), rows in ref.HARD_SETTINGS.items() for m in rows for b in blocks(2 if s == 35 else 1)
-    ]  # fmt: skip
-    severity = [Piece("severity", "slew", 45, m, b, a) for a in SEVERITIES for m in SEVERITY_METHODS for b in blocks(2)]
-    severity += [Piece("severity", "regulate", 45, "oracle", b, a) for a in (0.1, 0.2, 0.5, 0.9) for b in blocks(2)]
-    return table4 + bench + table5 + hard + severity
+    severity = [Piece("severity", "slew", 45, m, 0, a) for a in SEVERITIES for m in SEVERITY_METHODS]
+    severity += [Piece("severity", "regulate", 45, "oracle", 0, a) for a in (0.1, 0.2, 0.5, 0.9)]
+    others = {"MEKF": 2, "CLAIR": 2, "dual GAUKF": 1, "UKF": 1, "oracle": 1}
+    bench = [Piece("bench", "slew", s, m, b) for s in (45, 55, 75) for m, n in others.items() for b in blocks(n)]
+    settings = [Piece("hard", "slew", s, m, 0, level) for (s, level), rows in ref.HARD_SETTINGS.items() for m in rows]
+    table5 = [Piece("table5", "slew", 45, m, 0) for m in GRIDS]
+    ranges = [Piece("table5", *key, m, 0) for key, rows in ref.TABLE_5.items() for m in rows]
+    ranges += [Piece("table5", "slew", s, m, 0) for s in (55, 75) for m in GRIDS]
+    ranges += [Piece("table5", "slew", 45, m, b) for b in blocks(3) for m in GRIDS]
+    return list(dict.fromkeys(grids + table5 + table4 + hard + severity + bench + settings + ranges))
+
+
+def is_campaign(p: Piece) -> bool:
+    """Whether a block belongs to the campaign of the three filters on "bench"."""
+    return p.variant == "bench" and p.method in GRIDS
 
 
 # -- pieces that are not campaigns
@@ -143,8 +141,8 @@ def verdicts(r: Results) -> str:
     def rmse(g: str, s: int, m: str, phase: str = "faulty") -> float:
         return average(r.outcomes("table4", g, s, m), phase)
 
-    def accuracy(v: str, g: str, s: int, m: str) -> float:
-        hits = right(r.outcomes(v, g, s, m))
+    def accuracy(variant: str, m: str) -> float:
+        hits = right(r.outcomes(variant, "slew", 45, m))
         return 100 * float(np.mean(hits)) if hits else math.nan
 
     def steps(m: str) -> float:
@@ -163,7 +161,7 @@ def verdicts(r: Results) -> str:
     moved = [rmse("slew", s, "SGAUKF") for s in (45, 75)]
     still, after = rmse("slew", 45, "UKF"), rmse("slew", 45, "UKF", "post")
     odd, grid = rmse("slew", 45, "SGAUKF-odd"), rmse("slew", 45, "GAUKF")
-    plain, full = accuracy("bench", "slew", 45, "CAUKF"), accuracy("bench", "slew", 45, "GAUKF")
+    plain, full = ([accuracy(v, m) for v in ("bench", "table5")] for m in ("CAUKF", "GAUKF"))
     rows = [
         ["regulating: faulty-phase RMSE 0.02 to 0.05",
          f"{rest[0]:.3f} (45 dB), {rest[1]:.3f} (75 dB); \"always healthy\" has 0.43, told the changes "
@@ -177,8 +175,9 @@ def verdicts(r: Results) -> str:
          verdict(odd < 1.5 * moved[0], odd, moved[0])],
         ["SGAUKF as accurate as GAUKF (within 0.02 RMSE)", f"{moved[0]:.3f} and {grid:.3f}",
          verdict(abs(moved[0] - grid) < 0.02, grid, moved[0])],
-        ["CAUKF 10 to 20 points less accurate than GAUKF", f'"bench", 45 dB: {plain:.1f} and {full:.1f} %',
-         verdict(full - plain >= 10, full, plain)],
+        ["CAUKF 10 to 20 points less accurate than GAUKF",
+         f"45 dB: \"bench\" {plain[0]:.1f} and {full[0]:.1f} %, Table 5's ranges {plain[1]:.1f} and {full[1]:.1f} %",
+         verdict(full[1] - plain[1] >= 10, *full, *plain)],
         ["cost CAUKF : GAUKF : SGAUKF 1.52 : 1.37 : 1", f"filter steps {steps('CAUKF'):.2f} : {steps('GAUKF'):.2f} : 1",
          verdict(steps("CAUKF") > steps("GAUKF") > 1, steps("CAUKF"), steps("GAUKF")) + " in order"],
         ["SGAUKF 90.93 % at 45 dB on Table 5's ranges, here with excitation", *claimed_inside(45, "slew", 90.93)],
@@ -208,7 +207,7 @@ def tracking_figure(tracks: dict[str, dict[str, Any]], path: Path) -> None:
             ax.set_ylim(-0.3, 1.5)
         axes[0, column_].set_title(f"{reference}, 45 dB")
         axes[3, column_].set_xlabel("t [s]")
-    axes[0, 0].legend(loc="upper right", fontsize=8)
+    axes[0, 0].legend(loc="lower right", fontsize=8)
     figure.savefig(path, dpi=110)
 
 
@@ -226,7 +225,7 @@ def severity_figure(r: Results, path: Path) -> None:
         name = {"oracle": "oracle (changes and severity known)", "CLAIR": "CLAIR (changes known)"}.get(m, m)
         ax.plot(SEVERITIES, share, style, marker="o", ms=4, label=name)
     ax.axvline(0.05, color="0.7", lw=1)
-    ax.text(0.051, 3, "label threshold", fontsize=8, color="0.4")
+    ax.text(0.053, 4, "label threshold", fontsize=8, color="0.4")
     ax.set(xscale="log", xlabel="loss of effectiveness", ylabel="accuracy [%]", ylim=(-2, 103),
            title="Slew, 45 dB, windows of 30 s")  # fmt: skip
     ax.legend()
@@ -256,8 +255,18 @@ def main(arguments: Arguments) -> None:
     stars = f"{sum(r.tally)} of {len(r.tally)} compared figures agree within three standard errors."
     if len(wanted) < planned:
         stars += f" Of {planned} blocks {len(wanted)} have been run; rows without any are left out."
-    picture = "## Tracking\n\nTable 4's time line.\n\n![fault tracking](cmg_tracking.png)"
-    page.write_text("\n\n".join([INTRODUCTION + "\n" + stars, verdicts(r), picture, source_tables(r), tables]) + "\n")
+    minutes = [sum(v["seconds"] for p, v in r.found.items() if keep(p)) / 60 for keep in (is_campaign, lambda _: True)]
+    stars += (
+        f" The methods took {minutes[1]:.0f} core-minutes, {minutes[0]:.0f} of them the three filters of the source in the "
+        "campaign; batches on a shared machine."
+    )
+    picture = (
+        "## Tracking\n\nTable 4's time line. While regulating SGAUKF and MEKF see no fault; both lie at 1.\n\n"
+        "![fault tracking](cmg_tracking.png)"
+    )
+    page.write_text(
+        "\n\n".join([INTRODUCTION + "\n" + stars, verdicts(r), picture, campaign_tables(r), source_tables(r), tables]) + "\n"
+    )
     print(page)
 
 

@@ -33,7 +33,8 @@ Labels are the 16 sets of faulty units. Processes: "standard" (also "bench": one
 units fail and recover independently, mismatch 0.01), "fault-free", "paper" (also "table4": the source's time line), and
 "table5" (the source's random ranges; under "slew" also called "paper-slew").
 
-A flight ends early where attitude control is lost: the attitude error exceeds 60 deg, in "regulate" after 30 s.
+`info["det"]` is det(A A'), 0 where the cluster is singular; contact with a singularity does not end a flight. A flight
+ends early where attitude control is lost: the attitude error exceeds 60 deg, in "regulate" after 30 s.
 
 Sources: A. Rahimi's study of a simplified binary grid adaptation of the unscented filter for CMG faults (scenario,
 Tables 3 to 5); A. Rahimi, K. D. Kumar, H. Alighanbari, Mechanical Systems and Signal Processing 135, 2020, 106419;
@@ -245,10 +246,12 @@ def commanded_hdot(y, r):
     return -tau1 - (y[4] * h3 - y[5] * h2), -tau2 - (y[5] * h1 - y[3] * h3), -tau3 - (y[3] * h2 - y[4] * h1)
 
 
-@kernel
 def determinant(a, b, c, i, j, k):
     """Determinant of the columns i, j, k of the matrix with rows a, b, c."""
     return a[i] * (b[j] * c[k] - b[k] * c[j]) - a[j] * (b[i] * c[k] - b[k] * c[i]) + a[k] * (b[i] * c[j] - b[j] * c[i])
+
+
+_determinant = kernel(determinant)
 
 
 @kernel
@@ -269,10 +272,10 @@ def control(t, y, r, q, c, u):
         u[i] = (A[0][i] * z1 + A[1][i] * z2 + A[2][i] * z3) / H0
     if q[1] > 0.0:
         excitation = q[1] * np.sin(2.0 * np.pi * t / NULL_PERIOD)
-        u[0] += excitation * determinant(A[0], A[1], A[2], 1, 2, 3)
-        u[1] -= excitation * determinant(A[0], A[1], A[2], 0, 2, 3)
-        u[2] += excitation * determinant(A[0], A[1], A[2], 0, 1, 3)
-        u[3] -= excitation * determinant(A[0], A[1], A[2], 0, 1, 2)
+        u[0] += excitation * _determinant(A[0], A[1], A[2], 1, 2, 3)
+        u[1] -= excitation * _determinant(A[0], A[1], A[2], 0, 2, 3)
+        u[2] += excitation * _determinant(A[0], A[1], A[2], 0, 1, 3)
+        u[3] -= excitation * _determinant(A[0], A[1], A[2], 0, 1, 2)
     peak = max(max(abs(u[0]), abs(u[1])), max(abs(u[2]), abs(u[3])))
     if peak > R_MAX:
         for i in range(4):
@@ -304,9 +307,10 @@ def inertia(A: np.ndarray) -> np.ndarray:
 
 
 def singularity(d: np.ndarray) -> np.ndarray:
-    """det(A A') (...): 1.1857 at rest, 0 where the cluster is singular."""
-    A, _ = cluster(d)
-    return np.linalg.det(A @ np.swapaxes(A, -1, -2))
+    """det(A A') (...): 1.1857 at rest, 0 where the cluster is singular. By the squared minors of A (Cauchy, Binet)."""
+    A, _ = pyramid(*np.moveaxis(np.asarray(d, float), -1, 0))
+    minors = [determinant(*A, *columns) for columns in itertools.combinations(range(4), 3)]
+    return np.square(minors).sum(axis=0)
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -532,5 +536,6 @@ def plant(
         processes=processes(reference),
         q=np.array([float(steering == "robust"), NULL_AMPLITUDE if excitation == "null" else 0.0]),
         true_feedback=feedback == "true", physical=physical, perturb=perturb, reference=rows,
+        monitor=lambda state: {"det": singularity(state[..., 7:])},
         isolation_reward=np.eye(16) - 1.0, identification_reward=lambda error: -np.abs(error).mean(axis=-1),
     )  # fmt: skip
