@@ -47,7 +47,7 @@ class FDIVecEnv(VecEnv):
         options = self._options[0]
         if any(other != options for other in self._options):
             raise ValueError("the environments share the options of a reset; they were given different ones")
-        obs, infos = self.envs.reset(seed=list(self._seeds), options=options or None)
+        obs, infos = self.envs.reset(seed=list(self._seeds), options=options or None)  # type: ignore[arg-type]
         self.truth = self._read(infos)
         self.reset_infos = [{name: value[i] for name, value in self.truth.items()} for i in range(self.num_envs)]
         self._reset_seeds()
@@ -81,7 +81,7 @@ class FDIVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[Array | None]:
         """One picture per environment (`render_mode="rgb_array"`)."""
-        return list(self.envs.render() or [None] * self.num_envs)
+        return list(self.envs.render() or [None] * self.num_envs)  # type: ignore[return-value]
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """An attribute as the single environments have it: their own scenario, else what they share."""

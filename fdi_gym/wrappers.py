@@ -52,7 +52,7 @@ class VectorHistory(VectorWrapper):
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
         """Begin new episodes, in all environments or in those of `options["reset_mask"]`."""
-        obs, infos = self.env.reset(seed=seed, options=options)
+        obs, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         mask = (options or {}).get("reset_mask")
         begun = np.ones(self.num_envs, bool) if mask is None else mask
         self._ring[begun] = obs[begun, None]
@@ -118,7 +118,7 @@ class DelayAwareReward(VectorWrapper):
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
         """Begin new episodes, in all environments or in those of `options["reset_mask"]`."""
-        obs, infos = self.env.reset(seed=seed, options=options)
+        obs, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         mask = (options or {}).get("reset_mask")
         begun = np.ones(self.num_envs, bool) if mask is None else mask
         self._over &= ~begun

@@ -1,0 +1,67 @@
+"""How the committed networks were trained: one recipe per plant, and a general one for any other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from baselines.networks.flights import Source
+from baselines.networks.identification import Shape
+from baselines.networks.supervised import Recipe, Run
+
+BOTH = (Source("standard", {}), Source("hard", {}))
+GENERAL = Recipe(sources=(Source("standard", {}),), shape=Shape(stride=5, lags=6, degree=2))
+RECIPES = {
+    "B747Lateral": Recipe(sources=BOTH, shape=Shape(stride=4, lags=12, degree=1), flights=6144, validate=16),
+    "HUAVHover": Recipe(
+        sources=(Source("standard", {"kappa": 0.3}), Source("hard", {"kappa": 1.0})),
+        shape=Shape(stride=5, lags=6, degree=1), flights=8192, validate=16,
+    ),
+    "MissilePitch": Recipe(
+        sources=BOTH, shape=Shape(stride=2, lags=8, degree=3, effects=2, every=5), identify=200, flights=6144, validate=16,
+    ),
+    "CMGSatellite": Recipe(
+        sources=BOTH, shape=Shape(stride=20, lags=2, degree=2, effects=2, every=2),
+        identify=100, flights=1536, chunk=64, passes=8, validation=60, validate=8,
+    ),
+}  # fmt: skip
+FILTERS = {
+    "B747Lateral": "two_stage_kf_exponential_fast",
+    "HUAVHover": "ascdkf",
+    "MissilePitch": "augmented_ekf_imm",
+    "CMGSatellite": "sgaukf",
+}
+
+
+def train(
+    method: str, plant_id: str, *, budget: int | None = None, seed: int = 0, work: Path = Path("runs"), threads: int = 1
+) -> Path:
+    """Train a supervised network; the path of its weights.
+
+    Args:
+        method: "sequence_net", or "residual_net", which hears the plant's filter and starts from the other's weights.
+        plant_id: The plant.
+        budget: Training flights per process. Default: the recipe's.
+        seed: Of the run; each has training seeds of its own.
+        work: Folder of runs; one that was killed goes on.
+        threads: Of torch.
+
+    Raises:
+        ValueError: The plant has no filter to hear, or the folder holds another run.
+    """
+    recipe = RECIPES.get(plant_id, GENERAL)
+    if method == "residual_net":
+        if plant_id not in FILTERS:
+            raise ValueError(f"no filter is named for {plant_id} that a network could hear")
+        recipe = replace(
+            recipe, filter=FILTERS[plant_id], identify=100, flights=400, chunk=400, passes=24, validate=2, rate=1e-3
+        )
+    if budget is not None:
+        recipe = replace(recipe, flights=budget, chunk=min(recipe.chunk, budget))
+    command = (
+        f"fdi-gym train {method} {plant_id}"
+        + (f" --budget {budget}" if budget else "")
+        + (f" --seed {seed}" if seed else "")
+    )
+    folder = work / f"{method}-{plant_id}-{seed}"
+    return Run(method, plant_id, recipe, seed=seed, work=folder, command=command, threads=threads).run()
