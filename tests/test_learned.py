@@ -1,7 +1,8 @@
-"""Learned diagnosers: what is streamed is what was trained, runs resume exactly, weights are checked, splits are disjoint."""
+"""Learned diagnosers: a stream is seen as in training, runs resume exactly, weights are checked, splits are disjoint."""
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import pickle
 import sys
@@ -179,7 +180,7 @@ def test_splits_are_disjoint_from_the_suites_and_from_each_other():
     assert all(TEST <= first and last < VALIDATION for first, last in tested)
     for path in COMMITTED:
         splits = sorted(weights.read_card(path).seeds.values())
-        assert all(a[1] < b[0] for a, b in zip(splits[:-1], splits[1:], strict=True)), path
+        assert all(a[1] < b[0] for a, b in itertools.pairwise(splits)), path
         assert all(last < begin or end < first for begin, end in splits for first, last in tested), path
 
 
@@ -248,7 +249,7 @@ def test_pickles_zips_and_other_files_are_refused(tiny, tmp_path):
     with pytest.raises(weights.RefusedError, match="zip archive"):
         load(path)
     torch.save({"a": torch.zeros(1)}, tmp_path / "model.pt")
-    with pytest.raises(weights.RefusedError, match="not .pt"):
+    with pytest.raises(weights.RefusedError, match=r"not \.pt"):
         load(tmp_path / "model.pt")
 
 

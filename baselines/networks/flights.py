@@ -55,6 +55,20 @@ def fly(plant: Plant, source: Source, seeds: Sequence[int]) -> Record:
     return simulate(plant, [draw(process, seed) for seed in seeds])
 
 
+def selected(plant: Plant, source: Source, candidates: Sequence[int], count: int) -> list[int]:
+    """`count` of the candidate seeds, so that flights whose rarest label is any given one come as evenly as they can.
+
+    Where a process hardly ever shows a label, a network that is to know it must meet it more often than it occurs.
+    """
+    if len(candidates) == count:
+        return list(candidates)
+    shown = [np.unique(plant.label_rows(draw(plant.process(source.process), seed))) for seed in candidates]
+    often = np.bincount(np.concatenate(shown), minlength=len(plant.labels))
+    rarest = np.array([labels[np.argmin(often[labels])] for labels in shown])
+    turn = np.array([np.count_nonzero(rarest[:i] == label) for i, label in enumerate(rarest)])  # of its group
+    return [candidates[i] for i in sorted(np.lexsort((rarest, turn))[:count])]
+
+
 def at_steps(samples: Array, period: int) -> Array:
     """Recorded samples (N, K + 1, ...) at the newest sample of each step of `period` samples."""
     return samples[:, period - 1 :: period]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from baselines.networks import reinforcement
 from baselines.networks.flights import Source
 from baselines.networks.identification import Shape
 from baselines.networks.supervised import Recipe, Run
@@ -15,14 +16,14 @@ RECIPES = {
     "B747Lateral": Recipe(sources=BOTH, shape=Shape(stride=4, lags=12, degree=1), flights=6144, validate=16),
     "HUAVHover": Recipe(
         sources=(Source("standard", {"kappa": 0.3}), Source("hard", {"kappa": 1.0})),
-        shape=Shape(stride=5, lags=6, degree=1), flights=8192, validate=16,
+        shape=Shape(stride=5, lags=6, degree=1), flights=5120, candidates=8, validate=16,
     ),
     "MissilePitch": Recipe(
         sources=BOTH, shape=Shape(stride=2, lags=8, degree=3, effects=2, every=5), identify=200, flights=6144, validate=16,
     ),
     "CMGSatellite": Recipe(
         sources=BOTH, shape=Shape(stride=20, lags=2, degree=2, effects=2, every=2),
-        identify=100, flights=1536, chunk=64, passes=8, validation=60, validate=8,
+        identify=100, flights=1024, chunk=64, passes=8, validation=60, validate=8,
     ),
 }  # fmt: skip
 FILTERS = {
@@ -30,6 +31,16 @@ FILTERS = {
     "HUAVHover": "ascdkf",
     "MissilePitch": "augmented_ekf_imm",
     "CMGSatellite": "sgaukf",
+}
+
+STANDARD = Source("standard", {})
+POLICIES = {
+    "B747Lateral": reinforcement.Recipe(source=STANDARD, decision_period=5, length=32, decisions=300_000, updates=4),
+    "HUAVHover": reinforcement.Recipe(
+        source=Source("standard", {"kappa": 0.3}), decision_period=5, length=16, decisions=300_000, updates=4
+    ),
+    "MissilePitch": reinforcement.Recipe(source=STANDARD, decision_period=10, length=16, decisions=300_000, updates=4),
+    "CMGSatellite": reinforcement.Recipe(source=STANDARD, decision_period=50, length=16, decisions=300_000, updates=4),
 }
 
 
@@ -58,10 +69,35 @@ def train(
         )
     if budget is not None:
         recipe = replace(recipe, flights=budget, chunk=min(recipe.chunk, budget))
-    command = (
-        f"fdi-gym train {method} {plant_id}"
-        + (f" --budget {budget}" if budget else "")
-        + (f" --seed {seed}" if seed else "")
-    )
-    folder = work / f"{method}-{plant_id}-{seed}"
-    return Run(method, plant_id, recipe, seed=seed, work=folder, command=command, threads=threads).run()
+    where = {"seed": seed, "work": work / f"{method}-{plant_id}-{seed}", "threads": threads}
+    return Run(method, plant_id, recipe, command=_command(method, plant_id, budget, seed), **where).run()
+
+
+def train_ppo(
+    method: str, plant_id: str, *, budget: int | None = None, seed: int = 0, work: Path = Path("runs"), threads: int = 1
+) -> Path:
+    """Train a policy by PPO; the path of its weights.
+
+    Args:
+        method: "ppo" for the isolation task, "ppo_identification" for the other.
+        plant_id: The plant.
+        budget: Decisions. Default: the recipe's.
+        seed: Of the run.
+        work: Folder of runs; one that was killed goes on.
+        threads: Of torch.
+
+    Raises:
+        ValueError: The folder holds another run.
+    """
+    recipe = POLICIES.get(plant_id, reinforcement.Recipe(source=STANDARD))
+    if method == "ppo_identification":
+        recipe = replace(recipe, task="identification", entropy=0.0)
+    if budget is not None:
+        recipe = replace(recipe, decisions=budget)
+    where = {"seed": seed, "work": work / f"{method}-{plant_id}-{seed}", "threads": threads}
+    return reinforcement.Run(method, plant_id, recipe, command=_command(method, plant_id, budget, seed), **where).run()
+
+
+def _command(method: str, plant_id: str, budget: int | None, seed: int) -> str:
+    parts = ["fdi-gym train", method, plant_id, f"--budget {budget}" if budget else "", f"--seed {seed}" if seed else ""]
+    return " ".join(part for part in parts if part)

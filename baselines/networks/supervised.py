@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,7 @@ class Recipe:
         identify: Flights per process for the identification, before the others.
         chunk: Flights per process that are flown together ...
         passes: ... and shown so many times.
+        candidates: Seeds per training flight, from which those are taken that show rare labels.
         validation: Flights per process of the validation, and of the calibration.
         validate: Passes between validations.
         batch: Flights per step.
@@ -60,6 +62,7 @@ class Recipe:
     identify: int = 300
     chunk: int = 64
     passes: int = 4
+    candidates: int = 1
     validation: int = 100
     validate: int = 8
     batch: int = 32
@@ -74,7 +77,8 @@ class Progress:
     """What a run has, beside its network."""
 
     model: Model
-    prior: Array  # (processes, labels)
+    prior: Array  # (processes, labels) share of each label in flights as they come,
+    share: Array  # and in those that are selected for training
     passes: int = 0
     steps: int = 0
     seconds: float = 0.0
@@ -156,7 +160,20 @@ class Run:
             model = identification.identify(self.plant, recipe.shape, pairs)
             model = identification.standardised(self.plant, recipe.shape, model, np.concatenate([b[:40] for b in z]))
             self.make(model)
-        self.progress = Progress(model, np.maximum(prior, 1e-4))
+        share = np.stack([self.share_of(i) for i in range(len(recipe.sources))]) if recipe.candidates > 1 else prior
+        self.progress = Progress(model, np.maximum(prior, 1e-4), share)
+
+    def share_of(self, index: int) -> Array:
+        """Share of each label in the first chunk of training flights of a source, as they are planned."""
+        plant, source = self.plants[index], self.recipe.sources[index]
+        rows = [plant.label_rows(data.draw(plant.process(source.process), seed)) for seed in self.seeds_of(0, index)]
+        return np.bincount(np.concatenate(rows), minlength=len(plant.labels)) / sum(map(len, rows))
+
+    def seeds_of(self, chunk: int, index: int) -> list[int]:
+        """The seeds of a source's flights in a chunk."""
+        r = self.recipe
+        first = self.first + r.identify + chunk * r.chunk * r.candidates
+        return data.selected(self.plants[index], r.sources[index], range(first, first + r.chunk * r.candidates), r.chunk)
 
     def start_from(self, tensors: dict[str, Array]) -> None:
         """Take the weights of a network with fewer inputs; the further ones begin at 0."""
@@ -179,7 +196,7 @@ class Run:
         """Write the checkpoint whole."""
         p = self.progress
         tensors = {f"network.{k}": v.cpu().numpy() for k, v in self.network.state_dict().items()}
-        tensors |= {f"model.{k}": a for k, a in p.model._asdict().items()} | {"prior": p.prior}
+        tensors |= {f"model.{k}": a for k, a in p.model._asdict().items()} | {"prior": p.prior, "share": p.share}
         for i, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"adam.{i}.{k}": np.asarray(v.cpu().numpy()) for k, v in moments.items()}
         state = {"passes": p.passes, "steps": p.steps, "seconds": p.seconds, "curve": p.curve, "run": self.identity()}
@@ -193,7 +210,9 @@ class Run:
             state = json.loads(file.metadata()["state"])
         if state.pop("run") != self.identity():
             raise ValueError(f"{self.checkpoint} is of a run with another recipe or seed; move it away to begin a new one")
-        self.progress = Progress(Model(*(tensors[f"model.{k}"] for k in Model._fields)), tensors["prior"], **state)
+        self.progress = Progress(
+            Model(*(tensors[f"model.{k}"] for k in Model._fields)), tensors["prior"], tensors["share"], **state
+        )
         self.make(self.progress.model)
         self.network.load_state_dict({k: torch.from_numpy(tensors[f"network.{k}"]) for k in self.network.state_dict()})
         adam = self.optimiser.state_dict()
@@ -205,25 +224,28 @@ class Run:
 
     # -- training
 
-    def flown(self, seeds: range) -> tuple[Flights, list[Record]]:
-        """All sources' flights for these seeds."""
+    def flown(self, seeds: list[Sequence[int]]) -> tuple[Flights, list[Record]]:
+        """All sources' flights; seeds per source."""
         r = self.recipe
         found = [
-            data.prepare(self.plant_id, r.sources, i, r.shape, self.progress.model, r.filter, seeds)
-            for i in range(len(r.sources))
+            data.prepare(self.plant_id, r.sources, i, r.shape, self.progress.model, r.filter, of_source)
+            for i, of_source in enumerate(seeds)
         ]
         return data.joined([f for f, _ in found]), [record for _, record in found]
 
     def chunk(self, index: int) -> Flights:
         """The training flights of one chunk."""
-        first = self.first + self.recipe.identify + index * self.recipe.chunk
-        return self.flown(range(first, first + self.recipe.chunk))[0]
+        return self.flown([self.seeds_of(index, i) for i in range(len(self.plants))])[0]
+
+    def held_out(self, first: int) -> tuple[Flights, list[Record]]:
+        """The validation or calibration flights, which are the same for every source."""
+        return self.flown([range(first, first + self.recipe.validation)] * len(self.plants))
 
     def one_pass(self, flown: Flights) -> float:
         """Show the flights once, in an order of this pass's own; the mean loss."""
         p, r = self.progress, self.recipe
         labels = len(self.plant.labels)
-        balance = 1 / (labels * np.maximum(p.prior, RAREST))
+        balance = 1 / (labels * np.maximum(p.share, RAREST))
         order = np.random.default_rng([self.seed, p.passes]).permutation(len(flown.label))
         total = 0.0
         for i in range(0, len(order), r.batch):
@@ -275,7 +297,7 @@ class Run:
         """
         p, r = self.progress, self.recipe
         writer = SummaryWriter(str(self.work / "tensorboard"))
-        validation, records = self.flown(range(VALIDATION, VALIDATION + r.validation))
+        validation, records = self.held_out(VALIDATION)
         flown, flown_index = None, -1
         before = p.seconds - (time.perf_counter() - self.started)
         bar = tqdm(total=self.total, initial=p.passes, desc=f"{self.method} {self.plant_id}", unit="pass")
@@ -307,7 +329,7 @@ class Run:
     def calibrate(self, validation: Flights) -> dict[str, Any]:
         """Fit the calibration on its own flights and measure it on the validation flights."""
         p, r = self.progress, self.recipe
-        flown, _ = self.flown(range(CALIBRATION, CALIBRATION + r.validation))
+        flown, _ = self.held_out(CALIBRATION)
         fitted, measured = self.logits(flown).astype(float), self.logits(validation).astype(float)
         found = {}
         for index, source in enumerate(r.sources):
@@ -337,7 +359,7 @@ class Run:
             task="both",
             shape={**r.shape._asdict(), "hidden": r.hidden}, filter=r.filter,
             seeds={
-                "training": [self.first, self.first + r.identify + fresh - 1],
+                "training": [self.first, self.first + r.identify + fresh * r.candidates - 1],
                 "validation": [VALIDATION, VALIDATION + r.validation - 1],
                 "calibration": [CALIBRATION, CALIBRATION + r.validation - 1],
             },
