@@ -60,7 +60,10 @@ def accuracy_table() -> str:
         rows = rows_of(suite)
         filters = [r for r in rows.values() if not r.clairvoyant and r.diagnoser not in (*LEARNED, *FLOOR)]
         paper = best([r for r in filters if r.diagnoser not in REFERENCE])
-        bank, oracle = best([r for r in filters if r.diagnoser in REFERENCE]), best([r for r in rows.values() if r.clairvoyant])
+        bank, oracle = (
+            best([r for r in filters if r.diagnoser in REFERENCE]),
+            best([r for r in rows.values() if r.clairvoyant]),
+        )
         for name in LEARNED:
             if name in rows and name != "ppo_identification":
                 row = rows[name]
@@ -68,7 +71,16 @@ def accuracy_table() -> str:
                     suite, name, percent(row), f"{paper.diagnoser} {percent(paper)}" if paper else "-", verdict(row, paper),
                     f"{bank.diagnoser} {percent(bank)}" if bank else "-", verdict(row, bank), percent(oracle),
                 ])  # fmt: skip
-    head = ["suite", "learned", "per sample %", "best paper filter", "against it", "best reference bank", "against it", "oracle"]
+    head = [
+        "suite",
+        "learned",
+        "per sample %",
+        "best paper filter",
+        "against it",
+        "best reference bank",
+        "against it",
+        "oracle",
+    ]
     return markdown(head, lines)
 
 
@@ -100,7 +112,16 @@ def cost_table(cards: list[Card]) -> str:
             f"{first['seconds'] / 60:.1f}", f"at most {seen}", "-" if same is None else f"{same['seconds'] / 60:.1f}",
             f"{100 * max(e['accuracy']['standard'] for e in other.curve):.1f}", f"{other.budget['seconds'] / 60:.1f}",
         ])  # fmt: skip
-    head = ["plant", "PPO reaches %", "samples", "minutes", "supervision: samples", "minutes", "it ends at %", "after minutes"]
+    head = [
+        "plant",
+        "PPO reaches %",
+        "samples",
+        "minutes",
+        "supervision: samples",
+        "minutes",
+        "it ends at %",
+        "after minutes",
+    ]
     return markdown(head, lines)
 
 
@@ -145,14 +166,9 @@ def picture(card: Card, path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def main() -> None:
-    """Write the page and the pictures."""
-    folder = HOME / "learning"
-    folder.mkdir(exist_ok=True)
-    cards = [weights.read_card(path) for path in sorted(weights.WEIGHTS.glob("*.safetensors"))]
-    for card in cards:
-        picture(card, folder / f"{card.method}-{card.plant}.png")
-    text = (folder / "template.md").read_text()
+def page(cards: list[Card]) -> str:
+    """The page's text."""
+    text = (HOME / "learning" / "template.md").read_text()
     parts = {
         "accuracy": accuracy_table(), "calibration": calibration_table(cards), "cost": cost_table(cards),
         "identification": identification_table(), "budget": budget_table(cards),
@@ -160,8 +176,16 @@ def main() -> None:
     }  # fmt: skip
     for name, part in parts.items():
         text = text.replace(f"{{{{{name}}}}}", part)
-    write_whole(folder / "README.md", text.encode())
-    print(folder / "README.md")
+    return text
+
+
+def main() -> None:
+    """Write the page and the pictures."""
+    cards = [weights.read_card(path) for path in sorted(weights.WEIGHTS.glob("*.safetensors"))]
+    for card in cards:
+        picture(card, HOME / "learning" / f"{card.method}-{card.plant}.png")
+    write_whole(HOME / "learning" / "README.md", page(cards).encode())
+    print(HOME / "learning" / "README.md")
 
 
 if __name__ == "__main__":
