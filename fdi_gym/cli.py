@@ -1,4 +1,4 @@
-"""The command line: evaluate, verify, leaderboard, list, freeze."""
+"""The command line: evaluate, verify, leaderboard, list, freeze, train."""
 
 from __future__ import annotations
 
@@ -145,10 +145,43 @@ def freeze(
     print(evaluation.freeze(suite, folder or evaluation.SUITES))
 
 
+def train(
+    method: tyro.conf.Positional[str],
+    plant: tyro.conf.Positional[str],
+    budget: int | None = None,
+    seed: int = 0,
+    work: Path = Path("runs"),
+    threads: int = 1,
+    output: Path | None = None,
+) -> None:
+    """Train a diagnoser; a run that was killed goes on from its checkpoint and ends with the same weights.
+
+    Args:
+        method: Name of a trainer, or "module:function".
+        plant: Plant or environment id.
+        budget: How much to train: flights per process, or for reinforcement learning agent steps. Default: the recipe's.
+        seed: Of the run.
+        work: Folder of runs: checkpoint, tensorboard log, weights and card.
+        threads: Of torch.
+        output: Folder that gets a copy of weights and card.
+    """
+    import shutil
+
+    from fdi_gym.training import find_trainer
+
+    path = find_trainer(method).train(plant.split("-Faults-v")[0], budget=budget, seed=seed, work=work, threads=threads)
+    for suffix in (".safetensors", ".json"):
+        if output is not None:
+            output.mkdir(parents=True, exist_ok=True)
+            shutil.copy(path.with_suffix(suffix), output / f"{path.stem}{suffix}")
+    print(path if output is None else output / path.name)
+
+
 def main(argv: list[str] | None = None) -> None:
     """Entry point of `fdi-gym`. Errors that a user can mend are one line on stderr, exit status 2."""
     commands: dict[str, Any] = {
         "evaluate": evaluate, "verify": verify, "leaderboard": render, "list": show, "freeze": freeze,
+        "train": train,
     }  # fmt: skip
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="fdi-gym", args=argv)

@@ -1,0 +1,247 @@
+"""What a network sees: blocks of samples, and a model of the plant identified from training flights by least squares.
+
+The samples come in blocks of `stride`. Block k is reduced to z_k: the mean of its scaled samples, and the newest one. The
+model is identified on blocks; the network looks at every so many of them, since its steps are what training costs. A
+regression over training flights, whose truth is known, gives a model of the mean outputs of a block
+
+    y_k = W phi_k + sum_j delta_j V_j psi_k + noise of covariance R,
+
+phi_k the past blocks, the commands held over this one and their products, delta the scaled deviation of the estimated
+quantity from healthy and psi_k made of the outputs, the commands, what else is known, and products of them. A flight is
+then shown as its blocks, its whitened residuals e = R^(-1/2) (y - W phi), and the regularised recursive least-squares
+estimates of delta with several memories, from exponentially forgotten sums of S'e and S'S, S = R^(-1/2) [V_j psi]. All
+of it is causal, and nothing of it knows the plant's equations: it is learned from the observations and labels of
+training flights.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.signal
+
+from fdi_gym.plant import Array, Plant
+
+MEMORIES = np.array([4.0, 16.0, 64.0, 256.0])  # blocks
+RIDGE = 1e-7  # of the regression, as a share of the mean square of a regressor
+FAR = 20.0  # blocks with a scaled signal beyond this (a flight that diverges) teach the regression nothing
+KNEE = 4.0  # products are of signals that saturate smoothly here
+
+
+class Shape(NamedTuple):
+    """What the model is made of: samples per block, past blocks in phi, and the degree of the products in phi and psi.
+
+    Products are of the present signals and the outputs' magnitudes; a degree of 1 has none.
+    """
+
+    stride: int
+    lags: int
+    degree: int
+    effects: int = 1
+    every: int = 1  # blocks per step of the network
+
+    @property
+    def period(self) -> int:
+        """Samples per step of the network."""
+        return self.stride * self.every
+
+
+class Model(NamedTuple):
+    """The identified model, and mean and standard deviation of the features over training flights. All float32."""
+
+    W: Array  # (n_y, n_phi)
+    V: Array  # (n_estimated, n_y, n_psi)
+    whiten: Array  # (n_y, n_y): R^(-1/2)
+    mean: Array  # (n_features,)
+    std: Array  # (n_features,)
+
+
+def scaled(plant: Plant, obs: Array) -> Array:
+    """Observations (..., n_obs) as (value - nominal) / scale."""
+    return (obs - np.array([s.nominal for s in plant.observed])) / np.array([s.scale for s in plant.observed])
+
+
+def deviation(plant: Plant, target: Array) -> Array:
+    """The estimated quantity (..., n_estimated) as (value - healthy) / scale."""
+    healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
+    return (target - healthy) / np.array([s.scale for s in plant.estimated])
+
+
+def blocks(plant: Plant, obs: Array, stride: int) -> Array:
+    """Recorded observations (N, K + 1, n_obs) as (N, (K + 1) // stride, 2, n_obs): mean and newest of each block."""
+    n, samples, width = obs.shape
+    z = scaled(plant, obs[:, : samples // stride * stride]).reshape(n, -1, stride, width)
+    return np.stack([z.mean(axis=2), z[:, :, -1]], axis=2)
+
+
+@functools.cache
+def _products(width: int, degree: int) -> list[Array]:
+    return [
+        np.array(list(itertools.combinations_with_replacement(range(width), d))).reshape(-1, d) for d in range(2, degree + 1)
+    ]
+
+
+def regressors(plant: Plant, shape: Shape, past: Array, now: Array) -> tuple[Array, Array]:
+    """phi (..., n_phi), psi (..., n_psi) of a block (..., 2, n_obs) and those before, newest first (..., lags, 2, n_obs)."""
+    n_y = len(plant.outputs)
+    held = now[..., 0, n_y:]
+    here = KNEE * np.tanh(np.concatenate([past[..., 0, 1, :n_y], held], axis=-1) / KNEE)
+    wide = np.concatenate([here, np.abs(here[..., :n_y])], axis=-1)
+    one = np.ones((*here.shape[:-1], 1))
+    products = [wide[..., which].prod(axis=-1) for which in _products(wide.shape[-1], max(shape.degree, shape.effects))]
+    phi = [one, past.reshape(*past.shape[:-3], -1), held, *products[: shape.degree - 1]]
+    return np.concatenate(phi, axis=-1), np.concatenate([one, here, *products[: shape.effects - 1]], axis=-1)
+
+
+def _sequences(plant: Plant, shape: Shape, z: Array) -> tuple[Array, Array]:
+    """The regressors of the blocks lags, lags + 1, ... of whole flights z (N, T, 2, n_obs)."""
+    p, T = shape.lags, z.shape[1]
+    return regressors(plant, shape, np.stack([z[:, p - 1 - i : T - 1 - i] for i in range(p)], axis=2), z[:, p:])
+
+
+def identify(plant: Plant, shape: Shape, flights: Iterable[tuple[Array, Array]]) -> Model:
+    """Fit the model to flights: pairs of blocks (N, T, 2, n_obs) and their deviations (N, T, n_estimated).
+
+    The features' mean and standard deviation are left at 0 and 1: `standardised` sets them.
+    """
+    n_y = len(plant.outputs)
+    n_phi, n_psi, total = 0, 0, 0.0
+    G: Any = 0.0
+    for z, delta in flights:
+        phi, psi = _sequences(plant, shape, z)
+        n_phi, n_psi = phi.shape[-1], psi.shape[-1]
+        effects = (delta[:, shape.lags :, :, None] * psi[:, :, None]).reshape(*psi.shape[:2], -1)
+        rows = np.concatenate([phi, effects, z[:, shape.lags :, 0, :n_y]], axis=-1)
+        now = z[:, shape.lags :]
+        weight = (np.abs(now).max(axis=(2, 3)) < FAR) / (1 + (now**2).mean(axis=(2, 3)))
+        rows = (rows * np.sqrt(weight)[..., None]).reshape(-1, rows.shape[-1])
+        G = G + rows.T @ rows
+        total += weight.sum()
+    G = G / total
+    scale = np.sqrt(np.diag(G)[:-n_y]) + 1e-9
+    A, B = G[:-n_y, :-n_y] / scale[:, None] / scale, G[:-n_y, -n_y:] / scale[:, None]
+    C = np.linalg.solve(A + RIDGE * np.eye(len(A)), B) / scale[:, None]
+    joint = np.concatenate([-C, np.eye(n_y)])
+    power, directions = np.linalg.eigh(joint.T @ G @ joint)
+    whiten = (directions / np.sqrt(np.maximum(power, 1e-12))) @ directions.T
+    V = C[n_phi:].reshape(-1, n_psi, n_y).transpose(0, 2, 1)
+    width = 2 * len(plant.observed) + n_y + len(MEMORIES) * (3 * len(V) + 1)
+    return Model(*(np.ascontiguousarray(a, np.float32) for a in (C[:n_phi].T, V, whiten, np.zeros(width), np.ones(width))))
+
+
+def shapes(plant: Plant, shape: Shape) -> dict[str, tuple[int, ...]]:
+    """The shapes of a model's arrays as they lie in a weight file."""
+    n, n_y, p = len(plant.observed), len(plant.outputs), len(plant.estimated)
+    sizes = [len(which) for which in _products(n + n_y, max(shape.degree, shape.effects))]
+    n_phi, n_psi = 1 + 2 * shape.lags * n + n - n_y + sum(sizes[: shape.degree - 1]), 1 + n + sum(sizes[: shape.effects - 1])
+    width = 2 * n + n_y + len(MEMORIES) * (3 * p + 1)
+    found = {"W": (n_y, n_phi), "V": (p, n_y, n_psi), "whiten": (n_y, n_y), "mean": (width,), "std": (width,)}
+    return {f"model.{name}": value for name, value in found.items()}
+
+
+def information(model: Model, phi: Array, psi: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Whitened residuals e (..., n_y), S'e (..., p) and S'S (..., p, p) of mean outputs y (..., n_y)."""
+    e = (y - phi @ model.W.T.astype(float)) @ model.whiten.T.astype(float)
+    S = psi @ np.einsum("ab,jbx->xaj", model.whiten, model.V).astype(float).reshape(psi.shape[-1], -1)
+    S = S.reshape(*psi.shape[:-1], len(model.whiten), len(model.V))
+    St = np.swapaxes(S, -1, -2)
+    return e, (St @ e[..., None])[..., 0], St @ S
+
+
+def estimates(g: Array, info: Array) -> Array:
+    """What the sums of S'e (..., M, p) and S'S (..., M, p, p) say: estimates, their significance, spread and gain, flat."""
+    P = np.linalg.inv(info + np.eye(g.shape[-1]))
+    delta = (P @ g[..., None])[..., 0]
+    std = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
+    gain = (g * delta).sum(axis=-1, keepdims=True)
+    found = np.concatenate([np.arcsinh(2 * delta), np.arcsinh(delta / std), np.log(std), np.arcsinh(gain)], axis=-1)
+    return found.reshape(*found.shape[:-2], -1)
+
+
+def features(plant: Plant, shape: Shape, model: Model, z: Array) -> Array:
+    """Whole flights z (N, T, 2, n_obs) as a network sees them (N, T // every, n_features), float32."""
+    m, T = shape.every, z.shape[1] // shape.every * shape.every
+    z = z[:, :T]
+    phi, psi = _sequences(plant, shape, z)
+    known = information(model, phi, psi, z[:, shape.lags :, 0, : len(plant.outputs)])
+    e, g, info = (np.pad(a, [(0, 0), (T - a.shape[1], 0)] + [(0, 0)] * (a.ndim - 2)) for a in known)
+    keep = 1 - 1 / MEMORIES
+
+    def forgotten(part: Array) -> Array:
+        return np.stack(
+            [np.asarray(scipy.signal.lfilter([1.0], [1.0, -a], part, axis=1))[:, m - 1 :: m] for a in keep], axis=2
+        )
+
+    by_step = (len(z), T // m, m, -1)
+    mean, newest = z[:, :, 0].reshape(by_step).mean(axis=2), z[:, m - 1 :: m, 1]
+    return _assembled(shape, model, mean, newest, e.reshape(by_step).sum(axis=2), forgotten(g), forgotten(info)).astype(
+        np.float32
+    )
+
+
+def _assembled(shape: Shape, model: Model, mean: Array, newest: Array, e: Array, g: Array, info: Array) -> Array:
+    """The features of steps, from the means and newest samples, the sums of residuals, and the forgotten sums."""
+    seen = [np.arcsinh(mean), np.arcsinh(newest), np.arcsinh(e / np.sqrt(shape.every)), estimates(g, info)]
+    return (np.concatenate(seen, axis=-1) - model.mean) / model.std
+
+
+def standardised(plant: Plant, shape: Shape, model: Model, z: Array) -> Model:
+    """The model with the features' mean and standard deviation over these flights."""
+    seen = features(plant, shape, model, z).reshape(-1, len(model.mean)).astype(float)
+    return model._replace(mean=np.float32(seen.mean(axis=0)), std=np.float32(seen.std(axis=0) + 1e-3))
+
+
+class Stream(NamedTuple):
+    """The state of a stream of samples for n episodes; `add` takes one sample each."""
+
+    count: Array  # (n,) samples of the block that is being filled,
+    total: Array  # (n, n_obs) and their sum
+    past: Array  # (n, lags, 2, n_obs), newest first
+    filled: Array  # (n,) blocks so far
+    g: Array  # (n, M, p)
+    info: Array  # (n, M, p, p)
+    blocks: Array  # (n,) blocks of the step that is being filled,
+    means: Array  # (n, n_obs) the sum of their means
+    residuals: Array  # (n, n_y) and of their residuals
+
+
+def begin(plant: Plant, shape: Shape, n: int) -> Stream:
+    """The state before the first sample."""
+    p, M, width = len(plant.estimated), len(MEMORIES), len(plant.observed)
+    return Stream(
+        np.zeros(n), np.zeros((n, width)), np.zeros((n, shape.lags, 2, width)), np.zeros(n, np.int64),
+        np.zeros((n, M, p)), np.zeros((n, M, p, p)), np.zeros(n), np.zeros((n, width)), np.zeros((n, len(plant.outputs))),
+    )  # fmt: skip
+
+
+def add(plant: Plant, shape: Shape, model: Model, stream: Stream, obs: Array, k: int) -> tuple[Stream, Array | None]:
+    """Sample k (n, n_obs): the state after it and, at the end of a step, what `features` has there (n, n_features)."""
+    newest = scaled(plant, obs)
+    stream = stream._replace(count=stream.count + 1, total=stream.total + newest)
+    if (k + 1) % shape.stride:
+        return stream, None
+    stream = _close_block(plant, shape, model, stream, newest)
+    if (k + 1) % shape.period:
+        return stream, None
+    seen = _assembled(shape, model, stream.means / stream.blocks[:, None], newest, stream.residuals, stream.g, stream.info)
+    zeros = (np.zeros_like(a) for a in (stream.blocks, stream.means, stream.residuals))
+    return stream._replace(**dict(zip(("blocks", "means", "residuals"), zeros, strict=True))), seen
+
+
+def _close_block(plant: Plant, shape: Shape, model: Model, stream: Stream, newest: Array) -> Stream:
+    now = np.stack([stream.total / stream.count[:, None], newest], axis=1)
+    phi, psi = regressors(plant, shape, stream.past, now)
+    e, g, info = information(model, phi, psi, now[:, 0, : len(plant.outputs)])
+    ready = (stream.filled >= shape.lags).astype(float)
+    keep = (1 - 1 / MEMORIES)[:, None]
+    return Stream(
+        np.zeros_like(stream.count), np.zeros_like(stream.total),
+        np.concatenate([now[:, None], stream.past[:, :-1]], axis=1), stream.filled + 1,
+        keep * stream.g + (g * ready[:, None])[:, None],
+        keep[..., None] * stream.info + (info * ready[:, None, None])[:, None],
+        stream.blocks + 1, stream.means + now[:, 0], stream.residuals + e * ready[:, None],
+    )  # fmt: skip

@@ -1,0 +1,103 @@
+"""How the committed networks were trained: one recipe per plant, and a general one for any other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from baselines.networks import reinforcement
+from baselines.networks.flights import Source
+from baselines.networks.identification import Shape
+from baselines.networks.supervised import Recipe, Run
+
+BOTH = (Source("standard", {}), Source("hard", {}))
+GENERAL = Recipe(sources=(Source("standard", {}),), shape=Shape(stride=5, lags=6, degree=2))
+RECIPES = {
+    "B747Lateral": Recipe(sources=BOTH, shape=Shape(stride=4, lags=12, degree=1), flights=6144, validate=16),
+    "HUAVHover": Recipe(
+        sources=(Source("standard", {"kappa": 0.3}), Source("hard", {"kappa": 1.0})),
+        shape=Shape(stride=5, lags=6, degree=1), flights=5120, candidates=8, validate=16,
+    ),
+    "MissilePitch": Recipe(
+        sources=BOTH, shape=Shape(stride=2, lags=8, degree=3, effects=2, every=5), identify=200, flights=6144, validate=16,
+    ),
+    "CMGSatellite": Recipe(
+        sources=BOTH, shape=Shape(stride=20, lags=2, degree=2, effects=2, every=2),
+        identify=100, flights=1024, chunk=64, passes=8, validation=60, validate=8,
+    ),
+}  # fmt: skip
+FILTERS = {
+    "B747Lateral": "two_stage_kf_exponential_fast",
+    "HUAVHover": "ascdkf",
+    "MissilePitch": "augmented_ekf_imm",
+    "CMGSatellite": "sgaukf",
+}
+
+STANDARD = Source("standard", {})
+POLICIES = {
+    "B747Lateral": reinforcement.Recipe(source=STANDARD, decision_period=5, length=32, decisions=300_000, updates=4),
+    "HUAVHover": reinforcement.Recipe(
+        source=Source("standard", {"kappa": 0.3}), decision_period=5, length=16, decisions=300_000, updates=4
+    ),
+    "MissilePitch": reinforcement.Recipe(source=STANDARD, decision_period=10, length=16, decisions=300_000, updates=4),
+    "CMGSatellite": reinforcement.Recipe(source=STANDARD, decision_period=50, length=16, decisions=300_000, updates=4),
+}
+
+
+def train(
+    method: str, plant_id: str, *, budget: int | None = None, seed: int = 0, work: Path = Path("runs"), threads: int = 1
+) -> Path:
+    """Train a supervised network; the path of its weights.
+
+    Args:
+        method: "sequence_net", or "residual_net", which hears the plant's filter and starts from the other's weights.
+        plant_id: The plant.
+        budget: Training flights per process. Default: the recipe's.
+        seed: Of the run; each has training seeds of its own.
+        work: Folder of runs; one that was killed goes on.
+        threads: Of torch.
+
+    Raises:
+        ValueError: The plant has no filter to hear, or the folder holds another run.
+    """
+    recipe = RECIPES.get(plant_id, GENERAL)
+    if method == "residual_net":
+        if plant_id not in FILTERS:
+            raise ValueError(f"no filter is named for {plant_id} that a network could hear")
+        recipe = replace(
+            recipe, filter=FILTERS[plant_id], identify=100, flights=400, chunk=400, passes=24, validate=2, rate=1e-3
+        )
+    if budget is not None:
+        recipe = replace(recipe, flights=budget, chunk=min(recipe.chunk, budget))
+    where = {"seed": seed, "work": work / f"{method}-{plant_id}-{seed}", "threads": threads}
+    return Run(method, plant_id, recipe, command=_command(method, plant_id, budget, seed), **where).run()
+
+
+def train_ppo(
+    method: str, plant_id: str, *, budget: int | None = None, seed: int = 0, work: Path = Path("runs"), threads: int = 1
+) -> Path:
+    """Train a policy by PPO; the path of its weights.
+
+    Args:
+        method: "ppo" for the isolation task, "ppo_identification" for the other.
+        plant_id: The plant.
+        budget: Decisions. Default: the recipe's.
+        seed: Of the run.
+        work: Folder of runs; one that was killed goes on.
+        threads: Of torch.
+
+    Raises:
+        ValueError: The folder holds another run.
+    """
+    recipe = POLICIES.get(plant_id, reinforcement.Recipe(source=STANDARD))
+    if method == "ppo_identification":
+        recipe = replace(recipe, task="identification", entropy=0.0)
+    if budget is not None:
+        recipe = replace(recipe, decisions=budget)
+    where = {"seed": seed, "work": work / f"{method}-{plant_id}-{seed}", "threads": threads}
+    return reinforcement.Run(method, plant_id, recipe, command=_command(method, plant_id, budget, seed), **where).run()
+
+
+def _command(method: str, plant_id: str, budget: int | None, seed: int) -> str:
+    parts = ["fdi-gym train", method, plant_id, f"--budget {budget}" if budget else "", f"--seed {seed}" if seed else ""]
+    return " ".join(part for part in parts if part)

@@ -1,0 +1,192 @@
+"""Writes leaderboards/learning/: the page that sets the learned diagnosers beside filters and oracle, and learning curves.
+
+python -m baselines.networks.report
+
+Every figure is read from the rows of the leaderboards and from the cards of the weights.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from baselines.networks import weights
+from baselines.networks.weights import Card
+from fdi_gym.evaluation import Row, suite_names, write_whole
+from fdi_gym.leaderboard import markdown, read_row
+
+HOME = Path(__file__).parent.parent.parent / "leaderboards"
+LEARNED = ("sequence_net", "sequence_net_hard", "residual_net", "residual_net_hard", "ppo", "ppo_identification")
+REFERENCE = ("bayes_bank", "switching_bayes_bank", "hypothesis_bank")  # this package's own Bayesian banks, of no paper
+FLOOR = ("null", "random")
+
+
+def percent(row: Row | None) -> str:
+    """Balanced accuracy per sample with its interval."""
+    if row is None:
+        return "-"
+    found = row.metrics["per_sample"]
+    low, high = found["balanced_accuracy_interval"]
+    return f"{100 * found['balanced_accuracy']:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
+
+
+def best(rows: list[Row]) -> Row | None:
+    """The row with the highest balanced accuracy."""
+    return max(rows, key=lambda row: row.metrics["per_sample"]["balanced_accuracy"], default=None)
+
+
+def rows_of(suite: str) -> dict[str, Row]:
+    """A suite's rows by diagnoser."""
+    return {row.diagnoser: row for row in map(read_row, _files(suite))}
+
+
+def _files(suite: str) -> list[Path]:
+    return [path for path in sorted((HOME / "results" / suite).glob("*.json")) if path.name != "timing.json"]
+
+
+def verdict(row: Row, other: Row | None) -> str:
+    """Whether a row's interval lies above another's, overlaps it or lies below."""
+    if other is None:
+        return "-"
+    (low, high), (floor, ceiling) = (r.metrics["per_sample"]["balanced_accuracy_interval"] for r in (row, other))
+    gap = 100 * (row.metrics["per_sample"]["balanced_accuracy"] - other.metrics["per_sample"]["balanced_accuracy"])
+    return f"{gap:+.1f}, " + ("above" if low > ceiling else "below" if high < floor else "intervals overlap")
+
+
+def accuracy_table() -> str:
+    """One line per suite and learned diagnoser."""
+    lines = []
+    for suite in suite_names():
+        rows = rows_of(suite)
+        filters = [r for r in rows.values() if not r.clairvoyant and r.diagnoser not in (*LEARNED, *FLOOR)]
+        paper = best([r for r in filters if r.diagnoser not in REFERENCE])
+        bank, oracle = (
+            best([r for r in filters if r.diagnoser in REFERENCE]),
+            best([r for r in rows.values() if r.clairvoyant]),
+        )
+        for name in LEARNED:
+            if name in rows and name != "ppo_identification":
+                row = rows[name]
+                lines.append([
+                    suite, name, percent(row), f"{paper.diagnoser} {percent(paper)}" if paper else "-", verdict(row, paper),
+                    f"{bank.diagnoser} {percent(bank)}" if bank else "-", verdict(row, bank), percent(oracle),
+                ])  # fmt: skip
+    head = [
+        "suite",
+        "learned",
+        "per sample %",
+        "best paper filter",
+        "against it",
+        "best reference bank",
+        "against it",
+        "oracle",
+    ]
+    return markdown(head, lines)
+
+
+def calibration_table(cards: list[Card]) -> str:
+    """Log score and calibration error on the validation flights, before and after."""
+    lines = []
+    for card in cards:
+        for process, found in card.calibration.items():
+            (l0, l1), (e0, e1) = found["log_score"], found["calibration_error"]
+            lines.append([card.plant, card.method, process, f"{l0:.3f}", f"{l1:.3f}", f"{e0:.4f}", f"{e1:.4f}"])
+    return markdown(["plant", "network", "process", "log score before", "after", "calibration error before", "after"], lines)
+
+
+def cost_table(cards: list[Card]) -> str:
+    """What the policies cost beside supervision: samples and time until the same validated accuracy."""
+    supervised = {card.plant: card for card in cards if card.method == "sequence_net"}
+    lines = []
+    for card in cards:
+        if card.method != "ppo" or card.plant not in supervised:
+            continue
+        reached = max(entry["accuracy"]["standard"] for entry in card.curve)
+        first = next(e for e in card.curve if e["accuracy"]["standard"] == reached)
+        other = supervised[card.plant]
+        per_flight = other.budget["samples"] / other.budget["flights"]
+        same = next((e for e in other.curve if e["accuracy"]["standard"] >= reached), None)
+        seen = "-" if same is None else f"{len(other.processes) * same['flights'] * per_flight / 1e6:.1f} M"
+        lines.append([
+            card.plant, f"{100 * reached:.1f}", f"{first['step'] * card.shape['decision_period'] / 1e6:.1f} M",
+            f"{first['seconds'] / 60:.1f}", f"at most {seen}", "-" if same is None else f"{same['seconds'] / 60:.1f}",
+            f"{100 * max(e['accuracy']['standard'] for e in other.curve):.1f}", f"{other.budget['seconds'] / 60:.1f}",
+        ])  # fmt: skip
+    head = [
+        "plant",
+        "PPO reaches %",
+        "samples",
+        "minutes",
+        "supervision: samples",
+        "minutes",
+        "it ends at %",
+        "after minutes",
+    ]
+    return markdown(head, lines)
+
+
+def identification_table() -> str:
+    """Root mean square errors while a fault acts."""
+    lines = []
+    for suite in suite_names():
+        rows = rows_of(suite)
+        if "ppo_identification" in rows:
+            for name in ("null", "ppo_identification", *(n for n in LEARNED if n in rows and n.endswith("_net"))):
+                during = rows[name].metrics["rmse"]["during"]
+                lines.append([suite, name, *(f"{entry} {value:.3g}" for entry, value in during.items())])
+    return markdown(["suite", "method", *("" for _ in lines[0][2:])], lines) if lines else "No policy estimates yet."
+
+
+def budget_table(cards: list[Card]) -> str:
+    """What each committed file was trained with."""
+    lines = [
+        [f"`{card.command}`", f"{card.budget['samples'] / 1e6:.1f} M", f"{card.budget['seconds'] / 60:.1f}",
+         f"{card.seeds['training'][0]} to {card.seeds['training'][1]}", card.filter or "-"]
+        for card in cards
+    ]  # fmt: skip
+    return markdown(["command", "samples", "minutes", "training seeds", "hears"], lines)
+
+
+def picture(card: Card, path: Path) -> None:
+    """The learning curve: validated score over training time, with the score of the best paper filter on the suite."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 3.4), layout="constrained")
+    axes = figure.subplots()
+    minutes = [entry["seconds"] / 60 for entry in card.curve]
+    for name in card.curve[0]["accuracy"]:
+        values: list[Any] = [entry["accuracy"][name] for entry in card.curve]
+        axes.plot(minutes, values if name == "rmse" else [100 * v for v in values], label=name, marker=".", markersize=3)
+    score = "scaled RMSE" if "rmse" in card.curve[0]["accuracy"] else "balanced accuracy %"
+    axes.set(xlabel="minutes of training, one core of a shared machine", ylabel=f"{score}, validation flights")
+    axes.set_title(f"{card.method}, {card.plant}", fontsize=10)
+    axes.legend(frameon=False)
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=110)
+
+
+def page(cards: list[Card]) -> str:
+    """The page's text."""
+    text = (HOME / "learning" / "template.md").read_text()
+    parts = {
+        "accuracy": accuracy_table(), "calibration": calibration_table(cards), "cost": cost_table(cards),
+        "identification": identification_table(), "budget": budget_table(cards),
+        "curves": "\n".join(f"![{c.method}, {c.plant}]({c.method}-{c.plant}.png)" for c in cards),
+    }  # fmt: skip
+    for name, part in parts.items():
+        text = text.replace(f"{{{{{name}}}}}", part)
+    return text
+
+
+def main() -> None:
+    """Write the page and the pictures."""
+    cards = [weights.read_card(path) for path in sorted(weights.WEIGHTS.glob("*.safetensors"))]
+    for card in cards:
+        picture(card, HOME / "learning" / f"{card.method}-{card.plant}.png")
+    write_whole(HOME / "learning" / "README.md", page(cards).encode())
+    print(HOME / "learning" / "README.md")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,171 @@
+"""Weights on disk: a safetensors file, and beside it a card that says what they are, for what, and where they came from.
+
+Nothing that can run code is ever read: pickles and zip archives (a torch or stable-baselines3 file) are refused by their
+first bytes, whatever they are called.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from fdi_gym.evaluation import write_whole
+from fdi_gym.plant import Array, Plant
+
+WEIGHTS = Path(__file__).parent.parent / "learned" / "weights"
+
+
+class RefusedError(ValueError):
+    """Weights that are not what they should be; the message says why."""
+
+
+class WrongPlantError(RefusedError):
+    """Weights that are in order, but of another plant or other options."""
+
+
+class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What weights are.
+
+    Args:
+        method: The name of the trainer that made them.
+        env: Environment id, with its version; weights of another version are refused.
+        plant: Plant id.
+        options: Options of the plant, one dict per process that they were trained on.
+        processes: The fault processes, in the order in which the network is told of them.
+        labels, observed, estimated: Names, in order.
+        task: "isolation", "identification" or "both".
+        shape: What the network is made of.
+        filter: The diagnoser whose word it hears, or "".
+        seeds: First and last seed of the training, validation and calibration flights.
+        budget: What was used: flights, samples, steps, seconds.
+        curve: The training curve: one entry per validation.
+        calibration: Per process what was fitted on the calibration flights, and what it did on the validation flights.
+        command: What to type to train them again.
+        revision: Git revision of the code, or "".
+        versions: Of the libraries.
+        sha256: Digest of the weight file.
+    """
+
+    schema: int = 1
+    method: str
+    env: str
+    plant: str
+    options: list[dict[str, Any]]
+    processes: list[str]
+    labels: list[str]
+    observed: list[str]
+    estimated: list[str]
+    task: str
+    shape: dict[str, Any]
+    filter: str = ""
+    seeds: dict[str, list[int]]
+    budget: dict[str, float]
+    curve: list[dict[str, Any]]
+    calibration: dict[str, Any] = {}
+    command: str
+    revision: str
+    versions: dict[str, str]
+    sha256: str = ""
+
+
+def names(plant: Plant) -> dict[str, list[str]]:
+    """The names that a card and a plant must share."""
+    return {
+        "labels": [label.name for label in plant.labels],
+        "observed": [s.name for s in plant.observed],
+        "estimated": [s.name for s in plant.estimated],
+    }
+
+
+def made_with() -> tuple[str, dict[str, str]]:
+    """The git revision of this code ("" outside a repository), and the versions of the libraries."""
+    done = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], cwd=Path(__file__).parent, capture_output=True, text=True, check=False
+    )
+    return done.stdout.strip(), {name: version(name) for name in ("fdi-gym", "torch", "numpy", "scipy", "safetensors")}
+
+
+def write(path: Path, tensors: dict[str, Array], card: Card) -> None:
+    """Write weights and their card, `path` with .safetensors and with .json."""
+    content = save({name: np.asarray(a, order="C") for name, a in tensors.items()})
+    card = msgspec.structs.replace(card, sha256=hashlib.sha256(content).hexdigest())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path.with_suffix(".safetensors"), content)
+    write_whole(path.with_suffix(".json"), msgspec.json.format(msgspec.json.encode(card), indent=1) + b"\n")
+
+
+def read_tensors(path: Path) -> dict[str, Array]:
+    """The tensors of a safetensors file.
+
+    Raises:
+        RefusedError: Another kind of file, or a value that is not finite.
+    """
+    if path.suffix != ".safetensors":
+        raise RefusedError(f"{path}: weights are .safetensors files, not {path.suffix or 'without a suffix'}")
+    content = path.read_bytes()
+    for magic, what in ((b"\x80", "a pickle"), (b"PK", "a zip archive (torch or stable-baselines3)")):
+        if content.startswith(magic) and not content[8:9] == b"{":
+            raise RefusedError(f"{path} is {what}, which can run code when it is read; weights are safetensors")
+    try:
+        tensors = load(content)
+    except SafetensorError as error:
+        raise RefusedError(f"{path} is not a safetensors file: {error}") from error
+    for name, value in tensors.items():
+        if not np.isfinite(value).all():
+            raise RefusedError(f"{path}: {name} holds values that are not finite")
+    return tensors
+
+
+def read_card(path: Path) -> Card:
+    """The card beside the weights.
+
+    Raises:
+        RefusedError: There is none, or it is not a card.
+    """
+    try:
+        return msgspec.json.decode(path.with_suffix(".json").read_bytes(), type=Card)
+    except (OSError, msgspec.DecodeError) as error:
+        raise RefusedError(f"{path.with_suffix('.json')} is not a card: {error}") from error
+
+
+def read(path: Path, plant: Plant) -> tuple[dict[str, Array], Card]:
+    """Weights for a plant, checked against their card.
+
+    Raises:
+        RefusedError: The file, the card, or the two together are not what they should be; `WrongPlantError` where they
+            are, but for another plant.
+    """
+    tensors, card = read_tensors(path), read_card(path)
+    if hashlib.sha256(path.read_bytes()).hexdigest() != card.sha256:
+        raise RefusedError(f"{path}: the card belongs to another file: the digest differs")
+    if card.env != plant.env_id:
+        raise WrongPlantError(f"{path.name} was trained for {card.env}, not for {plant.env_id}")
+    for name, here in names(plant).items():
+        if getattr(card, name) != here:
+            raise WrongPlantError(f"{path.name} was trained with the {name} {getattr(card, name)}, not {here}")
+    if dict(plant.options) not in card.options:
+        raise WrongPlantError(f"{path.name} was trained with the options {card.options}, not {dict(plant.options)}")
+    return tensors, card
+
+
+def check_tensors(path: Path, tensors: dict[str, Array], expected: dict[str, tuple[int, ...]]) -> None:
+    """Make sure that the tensors are those of a network, by name and shape.
+
+    Raises:
+        RefusedError: One is missing, one too many, or of another shape.
+    """
+    for name in sorted(expected.keys() - tensors.keys()):
+        raise RefusedError(f"{path} lacks the tensor {name}")
+    for name in sorted(tensors.keys() - expected.keys()):
+        raise RefusedError(f"{path} has a tensor {name} that the network does not have")
+    for name, shape in expected.items():
+        if tensors[name].shape != shape:
+            raise RefusedError(f"{path}: {name} has the shape {tensors[name].shape}, the network needs {shape}")
