@@ -7,7 +7,7 @@ than health by the thresholds of its fault modes. `decide` adds persistence and 
 The statistics of this file serve any filter that estimates the fault vector:
 
 - "distance": gain in fit of the best faulty label, in the metric of the estimate's covariance;
-- "thresholds": the same in the metric of the typical fault sizes: fixed thresholds on the estimate;
+- "thresholds": the same in a fixed metric: thresholds on the estimate, never below a quarter of a typical fault;
 - "chi-square": weighted mean of the normalised innovation squared (R. K. Mehra, J. Peschon, Automatica 7, 1971);
 - "cusum": Page's cumulative sum of it (E. S. Page, Biometrika 41, 1954);
 - "glr": generalised likelihood ratio of a jump in the mean of the whitened innovations at an unknown time within a
@@ -56,6 +56,8 @@ class Persistence(NamedTuple):
 
 
 PERSISTENCE = Persistence()
+LEAST = 3.84  # a threshold is never below the 95 % point of one degree of freedom
+QUARTER = 0.25  # of the typical size: what LEAST is in the fixed metric of "thresholds"
 
 
 class Thresholds(NamedTuple):
@@ -161,7 +163,7 @@ def watch(plant: Plant, filter: FaultFilter, decision: str, size: Array, excess:
         raise ValueError(f"unknown decision {decision!r}; there are {', '.join(DECISIONS)}")
     groups, labels = manifolds(plant), len(plant.labels)
     healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
-    fixed = np.diag(size**2)[None]
+    fixed = np.diag((QUARTER * size) ** 2 / LEAST)[None]
     test = TESTS[decision]() if decision in TESTS else None
 
     def first(n: int) -> Any:

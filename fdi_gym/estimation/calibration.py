@@ -21,6 +21,7 @@ import numpy as np
 
 from fdi_gym.diagnosis import Diagnoser
 from fdi_gym.estimation.alarm import (
+    LEAST,
     PERSISTENCE,
     Detector,
     FaultFilter,
@@ -39,7 +40,6 @@ from fdi_gym.simulation import Record
 RATE = 0.05  # share of the healthy flights with a false alarm
 FIRST = 100_000  # calibration flights begin at VALIDATION_SEED + FIRST
 SAMPLES = 100_000  # about so many samples are flown, in 20 to 60 flights
-LEAST = 3.84  # a threshold is never below the 95 % point of one degree of freedom
 
 
 def _healthy_flights(plant: Plant, process: str) -> Record:
