@@ -58,20 +58,24 @@ def consistency_piece(suite: Suite, name: str) -> dict[str, Any]:
     return measure(suite.build(), suite.scenario, name)
 
 
+def reasons_of(suite: Suite) -> dict[str, str]:
+    """Why the methods that cannot run on a suite's plant cannot, in the code's words."""
+    return applicable(suite, suite.build(), list(diagnosers()))[1]
+
+
 def run(arguments: Arguments) -> dict[str, Any]:
-    """Fill the grid: the missing rows, then the missing consistency figures."""
-    for kind in KINDS:
-        for family in arguments.plants:
-            suite = load_suite(f"{family}-{kind}")
-            missing = [n for n in diagnosers() if not row_path(arguments.results, suite.name, n).exists()]
-            names, _ = applicable(suite, suite.build(), missing)
-            for name in names:  # one after the other: each row is written as soon as it is there
-                command = f"fdi-gym evaluate {suite.name} --diagnosers {name}"
-                rows, timing = evaluate(suite, [name], work=arguments.work, jobs=arguments.jobs, command=command)
-                write_rows(arguments.results, suite, rows, timing)
-    suites = [load_suite(f"{family}-{kind}") for family in arguments.plants for kind in KINDS]
+    """Fill the grid: the missing rows, then the figures beside them."""
+    suites = [load_suite(f"{family}-{kind}") for kind in KINDS for family in arguments.plants]
+    reasons = {suite.name: reasons_of(suite) for suite in suites}
+    for suite in suites:
+        for name in diagnosers():  # one after the other: each row is written as soon as it is there
+            if name in reasons[suite.name] or row_path(arguments.results, suite.name, name).exists():
+                continue
+            command = f"fdi-gym evaluate {suite.name} --diagnosers {name}"
+            rows, timing = evaluate(suite, [name], work=arguments.work, jobs=arguments.jobs, command=command)
+            write_rows(arguments.results, suite, rows, timing)
     jobs: dict[str, Any] = {f"{s.name}.{name}": (consistency_piece, (s, name)) for s in suites for name in FILTERS}
-    return pieces(arguments.work / "consistency", jobs, arguments.jobs)
+    return {"consistency": pieces(arguments.work / "consistency", jobs, arguments.jobs), "reasons": reasons}
 
 
 def accuracy(row: Row) -> tuple[float, float, float]:
@@ -132,14 +136,13 @@ def winners(found: dict[str, dict[str, Row]]) -> str:
     return markdown(["suite", "best method", "best filter of the plant's paper", "beaten by", "best oracle"], body)
 
 
-def reasons(suites: list[Suite]) -> str:
+def reasons_table(found: dict[str, dict[str, str]]) -> str:
     """The pairs without a row, with the code's reason."""
-    said: dict[tuple[str, str], list[str]] = {}
-    for suite in suites:
-        _, why = applicable(suite, suite.build(), list(diagnosers()))
+    said: dict[tuple[str, str], set[str]] = {}
+    for suite, why in found.items():
         for name, reason in why.items():
-            said.setdefault((suite.name.split("-")[0], reason), []).append(name)
-    body = [[plant, ", ".join(sorted(set(names))), reason] for (plant, reason), names in sorted(said.items())]
+            said.setdefault((suite.split("-")[0], reason), set()).add(name)
+    body = [[family, ", ".join(sorted(names)), reason] for (family, reason), names in sorted(said.items())]
     return markdown(["plant", "methods", "reason"], body)
 
 
@@ -154,31 +157,31 @@ def consistency_table(found: dict[str, Any]) -> str:
     return markdown(["suite", "filter", "NIS", "NEES of the state"], body)
 
 
-def page(results: Path, consistency: dict[str, Any]) -> str:
-    """The whole page."""
+def page(results: Path, figures: dict[str, Any]) -> str:
+    """The whole page, from the rows and the figures beside them."""
     parts = [INTRODUCTION]
     for kind in KINDS:
         found = {f"{family}-{kind}": rows_of(results, f"{family}-{kind}") for family in PAPER}
         parts.append(f"## {kind}\n\n{table(found)}\n\n### Who wins\n\n{winners(found)}")
-    parts.append("## Not applicable\n\n" + reasons([load_suite(f"{family}-standard") for family in PAPER]))
+    parts.append("## Not applicable\n\n" + reasons_table(figures.get("reasons", {})))
     parts.append(
         "## Consistency\n\nHealthy flights. Mean per dimension (1 where the filter is as sure of itself as it may be), and "
         "the share of samples on which the mean over 40 flights lies within its 95 % bounds. A filter that expects faults "
         "to walk in at any time is conservative on flights that have none: that is the price of seeing them.\n\n"
-        + consistency_table(consistency)
+        + consistency_table(figures.get("consistency", {}))
     )
     return "\n\n".join(parts) + "\n"
 
 
 def main(arguments: Arguments) -> None:
     """Fill the grid and write its page."""
-    figures = arguments.page.with_name("grid.json")
-    found = msgspec.json.decode(figures.read_bytes()) if figures.exists() else {}
+    kept = arguments.page.with_name("grid.json")
+    figures = msgspec.json.decode(kept.read_bytes()) if kept.exists() else {}
     if not arguments.page_only:
-        found |= run(arguments)
-        found = {key: found[key] for key in sorted(found)}
-        figures.write_bytes(msgspec.json.format(msgspec.json.encode(found), indent=2) + b"\n")
-    arguments.page.write_text(page(arguments.results, found))
+        for part, found in run(arguments).items():
+            figures[part] = {**figures.get(part, {}), **found}
+        kept.write_bytes(msgspec.json.format(msgspec.json.encode(figures, order="deterministic"), indent=2) + b"\n")
+    arguments.page.write_text(page(arguments.results, figures))
     print(arguments.page)
 
 
