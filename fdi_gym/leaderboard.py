@@ -217,7 +217,7 @@ episodes. Per sample, and per episode (one decision). Raw accuracy never ranks: 
 most of the time. By severity: share of right samples while the smallest active fault is small, medium, large. Delays in
 seconds, median (quartiles), right-censored where never reached. Missed: faults never detected, or already under an
 alarm when they began. RMSE of the estimated entries while a fault acts. The log score is the mean log probability of
-the true label (higher is better). Times per sample are those of the machine of the run, blocks of 50 episodes, one core.
+the true label (higher is better). Times per sample are processor times on the machine of the run, in blocks of 50 episodes.
 
 Check a row with `fdi-gym verify leaderboards/results/<suite>/<row>.json`.
 """
