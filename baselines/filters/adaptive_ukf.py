@@ -106,19 +106,22 @@ def adaptive_filter(plant: Plant, grid: str, process: str = "standard", walk: fl
 @diagnoser("adaptive_ukf_full", "Augmented UKF, covariance adapted by binary grid search, for any plant", grid="full")
 @diagnoser("adaptive_ukf_simplified", "The same with the simplified grid", grid="simplified")
 @diagnoser("adaptive_ukf_elements", "The same, element by element", grid="elements")
-def adaptive_ukf(plant: Plant, *, grid: str, process: str = "standard", walk: float = WALK) -> Diagnoser:
+def adaptive_ukf(
+    plant: Plant, *, grid: str = "full", decision: str = "distance", process: str = "standard", walk: float = WALK
+) -> Diagnoser:
     """The adaptive filter.
 
     Args:
         plant: Any plant whose estimated quantity enters additively and whose sensors have noise.
         grid: "full", "simplified" or "elements".
+        decision: "distance", "thresholds", "chi-square", "cusum" or "glr".
         process: The fault process that will be met; its declaration gives walks, model errors and thresholds.
         walk: Factor on the standard deviation of the faults' random walk; small, since the search follows the jumps.
 
     Raises:
         NotApplicableError: No sensor has noise, or the fault does not enter additively.
-        ValueError: Unknown grid or process.
+        ValueError: Unknown grid, decision or process.
     """
     model, filter = adaptive_filter(plant, grid, process, walk)
     what = f"adaptive ukf {grid} {walk}"
-    return calibrated_filter(plant, filter, "distance", model.prior.z_size, process=process, source=__file__, what=what)
+    return calibrated_filter(plant, filter, decision, model.prior.z_size, process=process, source=__file__, what=what)
