@@ -90,7 +90,8 @@ def single_flights(r: Results) -> str:
         "One flight against another, 75 dB: mean (lowest to highest). A single sample in which the recovery of unit 4 at "
         f"150 s is not yet seen makes a post RMSE of {np.sqrt(0.9**2 / 4 / 5000):.4f} alone, so the reference's GAUKF and "
         "CAUKF flight is one in which the flag rose at the first sample; there the step's own noise decides, since the "
-        "gimbal rate of unit 4 is small then.\n\n" + markdown(["case", "flights", "n", "pre", "faulty", "post"], rows)
+        "gimbal rate of unit 4 is small then. The table shows how low ours come.\n\n"
+        + markdown(["case", "flights", "n", "pre", "faulty", "post"], rows)
     )
 
 
