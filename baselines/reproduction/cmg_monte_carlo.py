@@ -44,7 +44,7 @@ def campaign_tables(r: Results) -> str:
         parts += matrices(r, variant)
     parts.append(
         "The source's Table 6 (SGAUKF, 45 dB, 1,500 episodes) prints no column 0, and 0 or 1 in each of its 210 other "
-        "off-diagonal cells, far sets as often as neighbours. An estimator with a threshold errs towards neighbours."
+        "off-diagonal cells, far sets as often as neighbours."
     )
     return "\n\n".join([*parts, cost(r)])
 

@@ -14,20 +14,15 @@ from typing import Any
 import numpy as np
 import tyro
 
-from baselines.filters.cramer_rao_oracle import Q_FLOOR, bound_step, first_covariance, opened
 from baselines.reproduction import cmg_reference as ref
-from baselines.reproduction.cmg_campaign import Piece, campaign, scenarios_of, watch
+from baselines.reproduction.cmg_campaign import Piece, campaign
+from baselines.reproduction.cmg_extras import TRIED, bound_piece, tracking_piece, tried_piece
 from baselines.reproduction.cmg_monte_carlo import GRIDS, campaign_tables
 from baselines.reproduction.cmg_source import source_tables
 from baselines.reproduction.cmg_statistics import Results, average, percent, right, wilson
 from baselines.reproduction.cmg_tables import SEVERITIES, SEVERITY_METHODS, SINGLE_FLIGHTS, reference_tables
 from baselines.reproduction.tables import markdown, pieces
-from fdi_gym.faults import FaultScenario
-from fdi_gym.plant import load_plant
-from fdi_gym.plants import cmg_satellite as cmg
-from fdi_gym.simulation import simulate
 
-AFTER = (100, 300, 1000, 3000)  # samples after the onset at which the bound is read
 INTRODUCTION = """# Satellite with four CMGs: reference figures, measured again
 
 Written by `python -m baselines.reproduction.cmg_satellite`. Cells read "reference / measured here"; a star marks a
@@ -80,41 +75,6 @@ def plan(quick: bool) -> list[Piece]:
 def is_campaign(p: Piece) -> bool:
     """Whether a block belongs to the campaign of the three filters on "bench"."""
     return p.variant == "bench" and p.method in GRIDS
-
-
-# -- pieces that are not campaigns
-
-
-def bound_piece(reference: str, snr: int, onset: int, count: int, excitation: str = "none") -> list[list[list[float]]]:
-    """sd of f along its principal directions (AFTER, count, 4) that the bound leaves after a change in healthy flight."""
-    plant = load_plant(cmg.ID, reference=reference, snr=snr, excitation=excitation)
-    steps = onset + AFTER[-1]
-    scenarios = [
-        FaultScenario(plant=cmg.ID, steps=steps, reference={"profile": reference}, noise_seed=900 + i) for i in range(count)
-    ]
-    record = simulate(plant, scenarios)
-    x, r, f = record.state, plant.split(record.obs)[1], np.ones((count, 4))
-    R = plant.R[:6, :6]
-    Q = np.diag([0.0] * 3 + [max(cmg.SIGMA_Q, Q_FLOOR) ** 2] * 3 + [0.0] * 4)
-    P, found = first_covariance(x[:, 0, :4], R, 0.0), []
-    for k in range(1, steps + 1):
-        P = bound_step(P, x[:, k - 1], x[:, k], r[:, k], f, Q, R, wheel=False)
-        if k - onset in AFTER:
-            found.append(np.sqrt(np.linalg.eigvalsh(P[:, 6:, 6:])).tolist())
-        if k == onset:
-            P = opened(P, np.ones(count, bool))
-    return found
-
-
-def tracking_piece(reference: str, every: int = 20) -> dict[str, Any]:
-    """Estimates over the source's time line at 45 dB, one sample in `every`."""
-    plant = load_plant(cmg.ID, reference=reference, snr=45)
-    scenarios = scenarios_of(Piece("table4", reference, 45, "SGAUKF", 0))[:1]
-    record = simulate(plant, scenarios)
-    found: dict[str, Any] = {"truth": record.theta[0, ::every].tolist()}
-    for method in ("SGAUKF", "MEKF", "CLAIR"):
-        found[method] = watch(plant, scenarios, record, method).theta[0, ::every].tolist()
-    return found
 
 
 # -- what can be reproduced, and what cannot
@@ -240,6 +200,7 @@ def main(arguments: Arguments) -> None:
         f"bound-{g}-{s}-{onset}": (bound_piece, (g, s, onset, count)) for g, s in ref.BOUND for onset in (4000, 10000)
     }
     jobs["bound-null"] = (bound_piece, ("regulate", 55, 4000, count, "null"))
+    jobs |= {f"tried-{i}": (tried_piece, (name,)) for i, name in enumerate(TRIED)}
     jobs |= {f"tracking-{g}": (tracking_piece, (g,)) for g in ("slew", "regulate")}
     kept = arguments.work / ("quick" if arguments.quick else "full")
     extra = pieces(kept, jobs, arguments.workers)
