@@ -37,10 +37,10 @@ STANDARD = Source("standard", {})
 POLICIES = {
     "B747Lateral": reinforcement.Recipe(source=STANDARD, decision_period=5, length=32, decisions=300_000, updates=4),
     "HUAVHover": reinforcement.Recipe(
-        source=Source("standard", {"kappa": 0.3}), decision_period=5, length=16, decisions=300_000, updates=4
+        source=Source("standard", {"kappa": 0.3}), decision_period=5, length=16, decisions=200_000, updates=4
     ),
-    "MissilePitch": reinforcement.Recipe(source=STANDARD, decision_period=10, length=16, decisions=300_000, updates=4),
-    "CMGSatellite": reinforcement.Recipe(source=STANDARD, decision_period=50, length=16, decisions=300_000, updates=4),
+    "MissilePitch": reinforcement.Recipe(source=STANDARD, decision_period=10, length=16, decisions=200_000, updates=4),
+    "CMGSatellite": reinforcement.Recipe(source=STANDARD, decision_period=50, length=16, decisions=200_000, updates=4),
 }
 
 
