@@ -52,7 +52,7 @@ def main() -> None:
     for plant_id in plant_sources():
         for period in (1, 10):
             arguments = {"units": "scaled", "decision_period": period}
-            n = 256
+            n = 1024
             dummy = pace(DummyVecEnv([lambda p=plant_id, a=arguments: FDIEnv(p, **a) for _ in range(16)]), seconds)
             bridge = pace(make_vec_env(f"{plant_id}-Faults-v0", n, **arguments), seconds)
             windows = pace(wrapped(plant_id, n), seconds) if period == 10 else float("nan")

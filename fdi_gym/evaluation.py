@@ -240,12 +240,13 @@ def _run_block(suite: Suite, names: Sequence[str], index: int, episodes: range, 
 
 
 def _source_digest(names: Sequence[str]) -> str:
-    """Digest of the sources that results depend on: blocks that other code made are not resumed from."""
+    """Digest of sources and weights that results depend on: blocks that others made are not resumed from."""
     found = hashlib.sha256()
     modules = {find_diagnoser(name).build.__module__.split(".")[0] for name in names} | {"fdi_gym"}
     for module in sorted(modules):
         home = Path(importlib.import_module(module).__file__ or "")
-        for path in sorted(home.parent.rglob("*.py")) if home.stem == "__init__" else [home]:
+        files = (p for kind in ("*.py", "*.safetensors") for p in home.parent.rglob(kind))
+        for path in sorted(files) if home.stem == "__init__" else [home]:
             found.update(path.name.encode() + b"\0" + path.read_bytes())
     return found.hexdigest()
 

@@ -126,9 +126,10 @@ def prepare(
     z = ident.blocks(plant, record.obs, shape.stride)
     n, T = len(z), z.shape[1] // shape.every
     process = np.full(n, index)
-    seen = [ident.features(plant, shape, model, z), context(process, len(sources), T)]
+    pieces = np.array_split(np.arange(n), max(1, n // 50))
+    own = np.concatenate([ident.features(plant, shape, model, z[i]) for i in pieces])
+    seen = [own, context(process, len(sources), T)]
     if filter_name:
-        pieces = np.array_split(np.arange(n), max(1, n // 50))
         task = joblib.delayed(words)
         heard = joblib.Parallel(n_jobs=-1)(task(plant_id, source, filter_name, record.obs[i], shape.period) for i in pieces)
         seen.append(np.concatenate(list(heard)))  # type: ignore[arg-type]

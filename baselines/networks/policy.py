@@ -12,9 +12,9 @@ import torch
 from torch import Tensor, nn
 
 
-def reduced(window: Tensor) -> Tensor:
-    """Windows of blocks (n, length, period, n_obs) as (n, length * 2 * n_obs): means and newest samples, compressed."""
-    return torch.asinh(torch.stack([window.mean(dim=2), window[:, :, -1]], dim=2)).flatten(1)
+def compressed(summaries: Tensor) -> Tensor:
+    """Summaries of blocks (n, length, 2, n_obs), as `fdi_gym.wrappers.BlockSummary` shows them, flat and compressed."""
+    return torch.asinh(summaries).flatten(1)
 
 
 class Policy(nn.Module):
@@ -30,7 +30,7 @@ class Policy(nn.Module):
 
     def forward(self, window: Tensor) -> Tensor:
         """The answer (n, widths[-1]) to windows (n, length, period, n_obs)."""
-        x = reduced(window)
+        x = compressed(torch.stack([window.mean(dim=2), window[:, :, -1]], dim=2))
         for layer in self.layers[:-1]:
             x = torch.tanh(layer(x))
         return self.layers[-1](x)

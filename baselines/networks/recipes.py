@@ -26,21 +26,21 @@ RECIPES = {
         identify=100, flights=1024, chunk=64, passes=8, validation=60, validate=8,
     ),
 }  # fmt: skip
-FILTERS = {
-    "B747Lateral": "two_stage_kf_exponential_fast",
-    "HUAVHover": "ascdkf",
-    "MissilePitch": "augmented_ekf_imm",
-    "CMGSatellite": "sgaukf",
+HEARD = {  # the filter that residual_net hears, and training flights per process: filters cost more than networks
+    "B747Lateral": ("two_stage_kf_exponential_fast", 400),
+    "HUAVHover": ("ascdkf", 400),
+    "MissilePitch": ("augmented_ekf_imm", 300),
+    "CMGSatellite": ("mekf", 100),
 }
 
 STANDARD = Source("standard", {})
 POLICIES = {
     "B747Lateral": reinforcement.Recipe(source=STANDARD, decision_period=5, length=32, decisions=300_000, updates=4),
     "HUAVHover": reinforcement.Recipe(
-        source=Source("standard", {"kappa": 0.3}), decision_period=5, length=16, decisions=300_000, updates=4
+        source=Source("standard", {"kappa": 0.3}), decision_period=5, length=16, decisions=200_000, updates=4
     ),
-    "MissilePitch": reinforcement.Recipe(source=STANDARD, decision_period=10, length=16, decisions=300_000, updates=4),
-    "CMGSatellite": reinforcement.Recipe(source=STANDARD, decision_period=50, length=16, decisions=300_000, updates=4),
+    "MissilePitch": reinforcement.Recipe(source=STANDARD, decision_period=10, length=16, decisions=200_000, updates=4),
+    "CMGSatellite": reinforcement.Recipe(source=STANDARD, decision_period=50, length=16, decisions=200_000, updates=4),
 }
 
 
@@ -62,11 +62,10 @@ def train(
     """
     recipe = RECIPES.get(plant_id, GENERAL)
     if method == "residual_net":
-        if plant_id not in FILTERS:
+        if plant_id not in HEARD:
             raise ValueError(f"no filter is named for {plant_id} that a network could hear")
-        recipe = replace(
-            recipe, filter=FILTERS[plant_id], identify=100, flights=400, chunk=400, passes=24, validate=2, rate=1e-3
-        )
+        name, flights = HEARD[plant_id]
+        recipe = replace(recipe, filter=name, identify=100, flights=flights, chunk=flights, passes=24, validate=2, rate=1e-3)
     if budget is not None:
         recipe = replace(recipe, flights=budget, chunk=min(recipe.chunk, budget))
     where = {"seed": seed, "work": work / f"{method}-{plant_id}-{seed}", "threads": threads}

@@ -30,25 +30,24 @@ from baselines.networks import flights as data
 from baselines.networks import weights
 from baselines.networks.adapters import from_torch
 from baselines.networks.flights import PER_SEED, TRAINING, VALIDATION, Source
-from baselines.networks.policy import Policy, actor_tensors, reduced
+from baselines.networks.policy import Policy, actor_tensors, compressed
 from fdi_gym.diagnosis import run
 from fdi_gym.evaluation import write_whole
 from fdi_gym.metrics import balanced_accuracy, scored_samples
 from fdi_gym.plant import Array
 from fdi_gym.sb3 import FDIVecEnv
-from fdi_gym.wrappers import DelayAwareReward, VectorHistory
+from fdi_gym.wrappers import BlockSummary, DelayAwareReward, VectorHistory
 
 
-class Reduced(BaseFeaturesExtractor):
-    """`reduced` as SB3 wants it."""
+class Compressed(BaseFeaturesExtractor):
+    """`compressed` as SB3 wants it."""
 
     def __init__(self, observation_space):
-        length, _, width = observation_space.shape
-        super().__init__(observation_space, length * 2 * width)
+        super().__init__(observation_space, int(np.prod(observation_space.shape)))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Features of observations."""
-        return reduced(observations)
+        return compressed(observations)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,11 +134,11 @@ class Run:
             labels = data.fly(self.plant, r.source, range(self.first, self.first + 200)).label
             share = np.bincount(labels.ravel(), minlength=len(self.plant.labels)) / labels.size
             envs = DelayAwareReward(envs, r.patience, np.minimum(1 / (len(share) * np.maximum(share, 1e-9)), 10.0).tolist())
-        venv = VecMonitor(FDIVecEnv(VectorHistory(envs, r.length, r.stride)))
+        venv = VecMonitor(FDIVecEnv(VectorHistory(BlockSummary(envs), r.length, r.stride)))
         return PPO(
             "MlpPolicy", venv, learning_rate=r.rate, n_steps=r.steps, batch_size=r.batch, n_epochs=r.epochs, gamma=0.0,
             gae_lambda=0.0, ent_coef=r.entropy, seed=self.seed, device="auto" if torch.cuda.is_available() else "cpu",
-            policy_kwargs={"features_extractor_class": Reduced, "net_arch": [r.hidden, r.hidden], "log_std_init": -1.0},
+            policy_kwargs={"features_extractor_class": Compressed, "net_arch": [r.hidden, r.hidden], "log_std_init": -1.0},
         )  # fmt: skip
 
     def identity(self) -> str:
