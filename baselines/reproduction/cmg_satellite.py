@@ -62,7 +62,7 @@ def plan(quick: bool) -> list[Piece]:
     hard = [Piece("hard", "slew", 45, m, b) for m in ref.HARD for b in blocks(1 if m == "dual GAUKF" else 2)]
     severity = [Piece("severity", "slew", 45, m, 0, a) for a in SEVERITIES for m in SEVERITY_METHODS]
     severity += [Piece("severity", "regulate", 45, "oracle", 0, a) for a in (0.1, 0.2, 0.5, 0.9)]
-    others = {"MEKF": 2, "CLAIR": 2, "dual GAUKF": 1, "UKF": 1, "oracle": 1}
+    others = {"MEKF": 4, "CLAIR": 4, "UKF": 4, "dual GAUKF": 4, "oracle": 1}
     bench = [Piece("bench", "slew", s, m, b) for s in (45, 55, 75) for m, n in others.items() for b in blocks(n)]
     settings = [Piece("hard", "slew", s, m, 0, level) for (s, level), rows in ref.HARD_SETTINGS.items() for m in rows]
     table5 = [Piece("table5", "slew", 45, m, 0) for m in GRIDS]
