@@ -31,7 +31,7 @@ INTRODUCTION = """# The grid
 
 Every method on every plant. Written by `python -m baselines.reproduction.grid` from the rows in `results/`. Balanced
 accuracy per sample in percent, with a 95 % bootstrap interval over the episodes; "-": not applicable, with the reason
-that the code gives below. Methods marked * know the truth. General methods need nothing but the plant's declaration.
+that the code gives, or not run yet, both below. Methods marked * know the truth. General methods need nothing but the plant's declaration.
 """
 
 
@@ -157,12 +157,21 @@ def consistency_table(found: dict[str, Any]) -> str:
     return markdown(["suite", "filter", "NIS", "NEES of the state"], body)
 
 
+def missing(results: Path, figures: dict[str, Any]) -> dict[str, list[str]]:
+    """Per suite, the methods that can run on it and have not."""
+    reasons = figures.get("reasons", {})
+    found = {s: sorted(set(diagnosers()) - set(rows_of(results, s)) - set(why)) for s, why in reasons.items()}
+    return {suite: names for suite, names in found.items() if names}
+
+
 def page(results: Path, figures: dict[str, Any]) -> str:
     """The whole page, from the rows and the figures beside them."""
     parts = [INTRODUCTION]
     for kind in KINDS:
         found = {f"{family}-{kind}": rows_of(results, f"{family}-{kind}") for family in PAPER}
         parts.append(f"## {kind}\n\n{table(found)}\n\n### Who wins\n\n{winners(found)}")
+    if absent := missing(results, figures):
+        parts.append("## Not run yet\n\n" + "\n".join(f"- {suite}: {', '.join(names)}" for suite, names in absent.items()))
     parts.append("## Not applicable\n\n" + reasons_table(figures.get("reasons", {})))
     parts.append(
         "## Consistency\n\nHealthy flights. Mean per dimension (1 where the filter is as sure of itself as it may be), and "
