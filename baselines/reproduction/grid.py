@@ -31,7 +31,8 @@ INTRODUCTION = """# The grid
 
 Every method on every plant. Written by `python -m baselines.reproduction.grid` from the rows in `results/`. Balanced
 accuracy per sample in percent, with a 95 % bootstrap interval over the episodes; "-": not applicable, with the reason
-that the code gives, or not run yet, both below. Methods marked * know the truth. General methods need nothing but the plant's declaration.
+that the code gives, or not run yet, both below. Methods marked * know the truth. General methods need nothing but the
+plant's declaration.
 """
 
 
@@ -160,7 +161,7 @@ def consistency_table(found: dict[str, Any]) -> str:
 def missing(results: Path, figures: dict[str, Any]) -> dict[str, list[str]]:
     """Per suite, the methods that can run on it and have not."""
     reasons = figures.get("reasons", {})
-    found = {s: sorted(set(diagnosers()) - set(rows_of(results, s)) - set(why)) for s, why in reasons.items()}
+    found = {s: sorted(set(diagnosers()) - set(rows_of(results, s)) - set(why)) for s, why in sorted(reasons.items())}
     return {suite: names for suite, names in found.items() if names}
 
 
