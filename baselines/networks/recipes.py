@@ -16,14 +16,14 @@ RECIPES = {
     "B747Lateral": Recipe(sources=BOTH, shape=Shape(stride=4, lags=12, degree=1), flights=6144, validate=16),
     "HUAVHover": Recipe(
         sources=(Source("standard", {"kappa": 0.3}), Source("hard", {"kappa": 1.0})),
-        shape=Shape(stride=5, lags=6, degree=1), flights=5120, candidates=8, validate=16,
+        shape=Shape(stride=5, lags=6, degree=1), flights=10240, candidates=8, validate=16,
     ),
     "MissilePitch": Recipe(
         sources=BOTH, shape=Shape(stride=2, lags=8, degree=3, effects=2, every=5), identify=200, flights=6144, validate=16,
     ),
     "CMGSatellite": Recipe(
         sources=BOTH, shape=Shape(stride=20, lags=2, degree=2, effects=2, every=2),
-        identify=100, flights=1024, chunk=64, passes=8, validation=60, validate=8,
+        identify=100, flights=2048, chunk=64, passes=8, validation=60, validate=16,
     ),
 }  # fmt: skip
 HEARD = {  # the filter that residual_net hears, and training flights per process: filters cost more than networks
