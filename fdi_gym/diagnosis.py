@@ -152,6 +152,11 @@ def make_diagnoser(name: str, plant: Plant, *, scenarios: Sequence[Any] | None =
     return guarded(entry.build(plant, **{**entry.settings, **tuning, **known}), plant)
 
 
+def told(name: str, process: str) -> dict[str, str]:
+    """`{"process": process}` where a method's builder asks which fault process to expect, else nothing."""
+    return {"process": process} if "process" in inspect.signature(find_diagnoser(name).build).parameters else {}
+
+
 # ---------------------------------------------------------------------------------------------------------------
 # The guard: one bad sample or one lost filter never reaches another episode, and never ends a run.
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import inspect
 import os
 import platform
 import time
@@ -22,7 +21,7 @@ import joblib
 import msgspec
 from tqdm import tqdm
 
-from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, make_diagnoser, run
+from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, make_diagnoser, run, told
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.metrics import Outcome, outcome, summarise
 from fdi_gym.plant import Plant, load_plant
@@ -196,8 +195,7 @@ def settings_of(suite: Suite, name: str) -> dict[str, Any]:
     Which process will be met is known to a method as the plant is: it may learn from flights of its own seeds.
     """
     entry = find_diagnoser(name)
-    asks = "process" in inspect.signature(entry.build).parameters
-    return {**({"process": suite.scenario} if asks else {}), **entry.settings, **suite.settings.get(name, {})}
+    return {**told(name, suite.scenario), **entry.settings, **suite.settings.get(name, {})}
 
 
 def diagnose(suite: Suite, plant: Plant, name: str, episodes: Sequence[int], record: Any = None) -> Block:

@@ -87,10 +87,10 @@ def test_streamed_diagnoses_are_those_of_the_whole_sequence(path):
     obs = record.obs[:, : 30 * shape.period + 3]
     seen = [identification.features(plant, shape, model, identification.blocks(plant, obs, shape.stride))]
     seen.append(flights.context(np.zeros(3, int), len(card.processes), 30))
-    if card.filter:
-        seen.append(flights.words(card.plant, source, card.filter, obs, shape.period))
-    x = torch.from_numpy(np.concatenate(seen, axis=2)).double()
-    net = SequenceNetwork(x.shape[2], len(plant.labels), len(plant.estimated), card.shape["hidden"]).double()
+    heard = flights.words(card.plant, source, card.filters, obs, shape.period)
+    x = torch.from_numpy(np.concatenate([*seen, *heard], axis=2)).double()
+    widths = tuple(word.shape[2] for word in heard)
+    net = SequenceNetwork(x.shape[2], len(plant.labels), len(plant.estimated), card.shape["hidden"], widths).double()
     net.load_state_dict({name: torch.from_numpy(tensors[f"network.{name}"]) for name in net.state_dict()})
     with torch.inference_mode():
         logits, mean, log_std, _ = (a.numpy() for a in net(x))

@@ -1,12 +1,11 @@
-"""A recurrent network over blocks of observations, and one that hears a filter too: trained under supervision.
+"""A recurrent network over blocks of observations, and one that hears filters too: trained under supervision.
 
 The network sees what `baselines.networks.identification` makes of the samples so far and answers at the end of each
 block; the answer holds until the next. It was trained with labels of equal weight, so its most probable label is the one
 that balanced accuracy asks for: that is the label it declares. The probabilities are calibrated for the process it
 expects (scale, bias per label), so the most probable label may be another where a label is rare.
 
-`sequence_net` expects the plant's "standard" process, `sequence_net_hard` the "hard" one: one network, told which, as
-the two Bayes banks of the 747 are.
+It is told which fault process to expect, as the filters are; one that it was not trained on it takes for the first.
 """
 
 from __future__ import annotations
@@ -17,26 +16,24 @@ from typing import Any
 import numpy as np
 
 from baselines.learned import network_module
-from fdi_gym.diagnosis import Diagnoser, Diagnosis, NotApplicableError, diagnoser, make_diagnoser
+from fdi_gym.diagnosis import Diagnoser, Diagnosis, NotApplicableError, diagnoser, make_diagnoser, told
 from fdi_gym.plant import Array, Plant
 from fdi_gym.training import trainer
 
 
 @diagnoser("sequence_net", "Recurrent network on observations, supervised", method="sequence_net")
-@diagnoser("sequence_net_hard", "The same, told to expect the hard process", method="sequence_net", expects="hard")
-@diagnoser("residual_net", "Recurrent network that hears a filter too, supervised", method="residual_net")
-@diagnoser("residual_net_hard", "The same, told to expect the hard process", method="residual_net", expects="hard")
-def sequence_net(plant: Plant, *, method: str = "sequence_net", expects: str = "standard", path: str = "") -> Diagnoser:
+@diagnoser("residual_net", "Recurrent network that hears filters too, supervised", method="residual_net")
+def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "standard", path: str = "") -> Diagnoser:
     """The trained network.
 
     Args:
         plant: A plant that there are weights for.
         method: Which network: "sequence_net" or "residual_net".
-        expects: The fault process that it is told to expect.
+        process: The fault process that it is told to expect.
         path: Weights of your own; their card lies beside them.
 
     Raises:
-        NotApplicableError: No weights for this plant and its options, no such process in them, or no torch.
+        NotApplicableError: No weights for this plant and its options, or no torch.
     """
     weights, network, ident, flights, calibration = (
         network_module(name) for name in ("weights", "network", "identification", "flights", "calibration")
@@ -50,26 +47,26 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", expects: str = "
         tensors, card = weights.read(file, plant)
     except weights.WrongPlantError as error:
         raise NotApplicableError(str(error)) from error
-    if expects not in card.processes:
-        raise NotApplicableError(f"was trained for {', '.join(card.processes)}, not for {expects!r}")
+    expected = process if process in card.processes else card.processes[0]
     shape = ident.Shape(**{name: card.shape[name] for name in ident.Shape._fields if name in card.shape})
     inputs = tensors["network.value.weight"].shape[1] if "network.value.weight" in tensors else 0
-    net = network.SequenceNetwork(inputs, len(plant.labels), len(plant.estimated), card.shape["hidden"]).double()
-    expected = {f"network.{name}": tuple(value.shape) for name, value in net.state_dict().items()}
-    weights.check_tensors(file, tensors, expected | ident.shapes(plant, shape))
+    words = (tensors["network.direct.weight"].shape[1],) if "network.direct.weight" in tensors else ()
+    net = network.SequenceNetwork(inputs, len(plant.labels), len(plant.estimated), card.shape["hidden"], words).double()
+    sizes = {f"network.{name}": tuple(value.shape) for name, value in net.state_dict().items()}
+    weights.check_tensors(file, tensors, sizes | ident.shapes(plant, shape))
     net.load_state_dict({name: torch.from_numpy(tensors[f"network.{name}"]) for name in net.state_dict()})
     model = ident.Model(*(tensors[f"model.{name}"] for name in ident.Model._fields))
-    process = card.processes.index(expects)
-    fitted = card.calibration[expects]
+    context = np.eye(len(card.processes))[card.processes.index(expected)]
+    fitted = card.calibration[expected]
     scale, bias, prior = fitted["scale"], np.array(fitted["bias"]), np.array(fitted["prior"])
     healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
     unit = np.array([s.scale for s in plant.estimated])
-    heard = make_diagnoser(card.filter, plant) if card.filter else None
+    heard = [make_diagnoser(name, plant, **told(name, expected)) for name in card.filters]
 
     def init(n: int) -> Any:
         said = Diagnosis(np.zeros(n, bool), np.zeros(n, np.int64), np.tile(healthy, (n, 1)), np.tile(unit, (n, 1)),
                          np.tile(prior / prior.sum(), (n, 1)))  # fmt: skip
-        return 0, ident.begin(plant, shape, n), np.zeros((n, card.shape["hidden"])), heard and heard.init(n), said
+        return 0, ident.begin(plant, shape, n), np.zeros((n, card.shape["hidden"])), [f.init(n) for f in heard], said
 
     def answer(features: Array, h: Array) -> tuple[Array, Diagnosis]:
         with torch.inference_mode():
@@ -82,15 +79,11 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", expects: str = "
     def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
         k, stream, h, inner, said = state
         stream, seen = ident.add(plant, shape, model, stream, obs, k)
-        word = None
-        if heard is not None:
-            inner, word = heard.update(inner, obs)
+        further = [f.update(own, obs) for f, own in zip(heard, inner, strict=True)]
         if seen is not None:
-            parts = [seen, np.tile(np.eye(len(card.processes))[process], (len(obs), 1))]
-            if word is not None:
-                parts.append(flights.word(plant, word))
+            parts = [seen, np.tile(context, (len(obs), 1)), *(flights.word(plant, word) for _, word in further)]
             h, said = answer(np.concatenate(parts, axis=1), h)
-        return (k + 1, stream, h, inner, said), said
+        return (k + 1, stream, h, [own for own, _ in further], said), said
 
     return Diagnoser(init, update)
 
@@ -101,7 +94,7 @@ def train_sequence_net(plant_id: str, **arguments: Any) -> Path:
     return network_module("recipes").train("sequence_net", plant_id, **arguments)
 
 
-@trainer("residual_net", "The network that hears a filter too; starts from sequence_net")
+@trainer("residual_net", "The network that hears filters too; starts from sequence_net")
 def train_residual_net(plant_id: str, **arguments: Any) -> Path:
-    """Train the network that hears a filter."""
+    """Train the network that hears filters."""
     return network_module("recipes").train("residual_net", plant_id, **arguments)

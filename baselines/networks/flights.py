@@ -11,7 +11,7 @@ import numpy as np
 
 from baselines.networks import identification as ident
 from baselines.networks.identification import Model, Shape
-from fdi_gym.diagnosis import Diagnosis, make_diagnoser, run
+from fdi_gym.diagnosis import Diagnosis, make_diagnoser, run, told
 from fdi_gym.faults import draw
 from fdi_gym.metrics import scored_samples
 from fdi_gym.plant import Array, Plant, load_plant
@@ -97,10 +97,13 @@ def word(plant: Plant, said: Diagnosis) -> Array:
     return np.nan_to_num(np.concatenate(found, axis=1), nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def words(plant_id: str, source: Source, filter_name: str, obs: Array, period: int) -> Array:
-    """What a filter says at the newest sample of each step: (N, T, ...), float32."""
-    plant = plant_of(plant_id, source)
-    said = run(make_diagnoser(filter_name, plant), obs, signals=True)
+def words(plant_id: str, source: Source, filters: Sequence[str], obs: Array, period: int) -> list[Array]:
+    """What each filter says at the newest sample of each step: (N, T, ...), float32."""
+    return [_words(plant_of(plant_id, source), source, name, obs, period) for name in filters]
+
+
+def _words(plant: Plant, source: Source, name: str, obs: Array, period: int) -> Array:
+    said = run(make_diagnoser(name, plant, **told(name, source.process)), obs, signals=True)
     parts = [getattr(said, name) for name in ("alarm", "mode", "theta", "theta_std", "mode_probs")]
     n, samples = said.mode.shape
     steps = samples // period
@@ -117,7 +120,13 @@ def context(process: Array, processes: int, steps: int) -> Array:
 
 
 def prepare(
-    plant_id: str, sources: Sequence[Source], index: int, shape: Shape, model: Model, filter_name: str, seeds: Sequence[int]
+    plant_id: str,
+    sources: Sequence[Source],
+    index: int,
+    shape: Shape,
+    model: Model,
+    filters: Sequence[str],
+    seeds: Sequence[int],
 ) -> tuple[Flights, Record]:
     """Fly one source's seeds and show them as a network sees them."""
     source = sources[index]
@@ -129,10 +138,10 @@ def prepare(
     pieces = np.array_split(np.arange(n), max(1, n // 50))
     own = np.concatenate([ident.features(plant, shape, model, z[i]) for i in pieces])
     seen = [own, context(process, len(sources), T)]
-    if filter_name:
+    if filters:
         task = joblib.delayed(words)
-        heard = joblib.Parallel(n_jobs=-1)(task(plant_id, source, filter_name, record.obs[i], shape.period) for i in pieces)
-        seen.append(np.concatenate(list(heard)))  # type: ignore[arg-type]
+        heard = joblib.Parallel(n_jobs=-1)(task(plant_id, source, filters, record.obs[i], shape.period) for i in pieces)
+        seen.append(np.concatenate([np.concatenate(piece, axis=2) for piece in heard]))  # type: ignore[arg-type]
     scoring = plant.process(source.process).scoring
     scored = np.stack([scored_samples(record.label[i], int(record.length[i]), scoring) for i in range(n)])
     truth = [at_steps(a, shape.period)[:, :T] for a in (record.label, ident.deviation(plant, record.target), scored)]

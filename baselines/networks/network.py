@@ -6,6 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+TRUST = 3.0  # in the filters' labels before training: a logit
+
 
 class SequenceNetwork(nn.Module):
     """Logits of the labels, and mean and log standard deviation of the estimated deviation, causally.
@@ -18,9 +20,11 @@ class SequenceNetwork(nn.Module):
         labels: Labels of the isolation task.
         estimated: Entries of the identification task.
         hidden: Width of every layer.
+        words: Entries of what each filter says, at the end of an input. They reach the logits directly, too: an untrained
+            network believes the labels that the filters declare, and training corrects that.
     """
 
-    def __init__(self, features: int, labels: int, estimated: int, hidden: int):
+    def __init__(self, features: int, labels: int, estimated: int, hidden: int, words: tuple[int, ...] = ()):
         super().__init__()
         self.labels, self.estimated, self.hidden = labels, estimated, hidden
         self.value, self.gate = nn.Linear(features, hidden), nn.Linear(features, hidden)
@@ -28,6 +32,11 @@ class SequenceNetwork(nn.Module):
         self.memory = nn.GRU(hidden, hidden, batch_first=True)
         self.read = nn.Linear(hidden, hidden)
         self.heads = nn.Linear(hidden, labels + 2 * estimated)
+        self.words = sum(words)
+        if words:
+            self.direct = nn.Linear(self.words, labels, bias=False)
+            believe = [torch.eye(labels, width) * TRUST / len(words) for width in words]
+            self.direct.weight.data = torch.cat(believe, dim=1)
 
     def forward(self, x: Tensor, h: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Features (N, T, n) after the memory h (1, N, hidden): logits, mean, log std (N, T, ...), and the memory."""
@@ -36,6 +45,8 @@ class SequenceNetwork(nn.Module):
         remembered, after = self.memory(seen, h)
         out = self.heads(F.silu(self.read(seen + remembered)))
         logits, mean, log_std = out.split([self.labels, self.estimated, self.estimated], dim=-1)
+        if self.words:
+            logits = logits + self.direct(x[..., -self.words :])
         return logits, mean, log_std.clamp(-6.0, 3.0), after
 
 

@@ -26,12 +26,13 @@ RECIPES = {
         identify=100, flights=2048, chunk=64, passes=8, validation=60, validate=16,
     ),
 }  # fmt: skip
-HEARD = {  # the filter that residual_net hears, and training flights per process: filters cost more than networks
-    "B747Lateral": ("two_stage_kf_exponential_fast", 400),
-    "HUAVHover": ("ascdkf", 400),
-    "MissilePitch": ("augmented_ekf_imm", 300),
-    "CMGSatellite": ("mekf", 100),
+HEARD = {  # the filters that residual_net hears, and training flights per process: filters cost more than networks
+    "B747Lateral": (("bayes_bank", "switching_bayes_bank"), 600),
+    "HUAVHover": (("hypothesis_bank", "ascdkf"), 600),
+    "MissilePitch": (("augmented_ekf_imm", "augmented_ekf_mode_probabilities"), 600),
+    "CMGSatellite": (("mekf",), 300),
 }
+GENERAL_HEARD = (("augmented_ekf", "multiple_model_ekf"), 300)
 
 STANDARD = Source("standard", {})
 POLICIES = {
@@ -50,7 +51,7 @@ def train(
     """Train a supervised network; the path of its weights.
 
     Args:
-        method: "sequence_net", or "residual_net", which hears the plant's filter and starts from the other's weights.
+        method: "sequence_net", or "residual_net", which hears the plant's filters and starts from the other's weights.
         plant_id: The plant.
         budget: Training flights per process. Default: the recipe's.
         seed: Of the run; each has training seeds of its own.
@@ -58,14 +59,14 @@ def train(
         threads: Of torch.
 
     Raises:
-        ValueError: The plant has no filter to hear, or the folder holds another run.
+        ValueError: There is no network to start from, or the folder holds another run.
     """
     recipe = RECIPES.get(plant_id, GENERAL)
     if method == "residual_net":
-        if plant_id not in HEARD:
-            raise ValueError(f"no filter is named for {plant_id} that a network could hear")
-        name, flights = HEARD[plant_id]
-        recipe = replace(recipe, filter=name, identify=100, flights=flights, chunk=flights, passes=24, validate=2, rate=1e-3)
+        filters, flights = HEARD.get(plant_id, GENERAL_HEARD)
+        recipe = replace(
+            recipe, filters=filters, identify=100, flights=flights, chunk=flights, passes=20, validate=2, rate=1e-3
+        )
     if budget is not None:
         recipe = replace(recipe, flights=budget, chunk=min(recipe.chunk, budget))
     where = {"seed": seed, "work": work / f"{method}-{plant_id}-{seed}", "threads": threads}

@@ -141,7 +141,7 @@ def budget_table(cards: list[Card]) -> str:
     """What each committed file was trained with."""
     lines = [
         [f"`{card.command}`", f"{card.budget['samples'] / 1e6:.1f} M", f"{card.budget['seconds'] / 60:.1f}",
-         f"{card.seeds['training'][0]} to {card.seeds['training'][1]}", card.filter or "-"]
+         f"{card.seeds['training'][0]} to {card.seeds['training'][1]}", ", ".join(card.filters) or "-"]
         for card in cards
     ]  # fmt: skip
     return markdown(["command", "samples", "minutes", "training seeds", "hears"], lines)

@@ -40,7 +40,7 @@ class Recipe:
     Args:
         sources: Fault processes, with the options of the plant.
         shape: Of the identified model.
-        filter: A diagnoser whose word the network hears; training then starts from the network that hears none.
+        filters: Diagnosers whose words the network hears; training then starts from the network that hears none.
         flights: Training flights per process.
         identify: Flights per process for the identification, before the others.
         chunk: Flights per process that are flown together ...
@@ -57,7 +57,7 @@ class Recipe:
 
     sources: tuple[Source, ...]
     shape: Shape
-    filter: str = ""
+    filters: tuple[str, ...] = ()
     flights: int = 2048
     identify: int = 300
     chunk: int = 64
@@ -126,13 +126,11 @@ class Run:
     def make(self, model: Model) -> None:
         """The network and its optimiser."""
         p, recipe = self.plant, self.recipe
-        heard = 0
-        if recipe.filter:
-            record = data.fly(p, recipe.sources[0], [self.first])
-            obs = record.obs[:, : 2 * recipe.shape.period]
-            heard = data.words(self.plant_id, recipe.sources[0], recipe.filter, obs, recipe.shape.period).shape[-1]
-        width = len(model.mean) + len(recipe.sources) + heard
-        self.network = SequenceNetwork(width, len(p.labels), len(p.estimated), recipe.hidden).to(self.device)
+        obs = data.fly(p, recipe.sources[0], [self.first]).obs[:, : 2 * recipe.shape.period]
+        heard = data.words(self.plant_id, recipe.sources[0], recipe.filters, obs, recipe.shape.period)
+        words = tuple(word.shape[-1] for word in heard)
+        width = len(model.mean) + len(recipe.sources) + sum(words)
+        self.network = SequenceNetwork(width, len(p.labels), len(p.estimated), recipe.hidden, words).to(self.device)
         self.optimiser = torch.optim.AdamW(self.network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
 
     def begin(self) -> None:
@@ -141,7 +139,7 @@ class Run:
         seeds = range(self.first, self.first + recipe.identify)
         records = [data.fly(p, s, seeds) for p, s in zip(self.plants, recipe.sources, strict=True)]
         prior = np.stack([np.bincount(r.label.ravel(), minlength=len(self.plant.labels)) / r.label.size for r in records])
-        if recipe.filter:
+        if recipe.filters:
             path = weights.WEIGHTS / f"sequence_net-{self.plant_id}.safetensors"
             if not path.exists():
                 raise ValueError(f"a network that hears a filter starts from {path.name}: train sequence_net first")
@@ -176,10 +174,12 @@ class Run:
         return data.selected(self.plants[index], r.sources[index], range(first, first + r.chunk * r.candidates), r.chunk)
 
     def start_from(self, tensors: dict[str, Array]) -> None:
-        """Take the weights of a network with fewer inputs; the further ones begin at 0."""
+        """Take the weights of a network that hears no filter; the further inputs begin at 0, but for the direct way."""
         state = self.network.state_dict()
         plain = self.network.value.in_features - tensors["network.value.weight"].shape[1]
         for name, value in state.items():
+            if name == "direct.weight":
+                continue
             old = torch.from_numpy(tensors[f"network.{name}"])
             if name in ("value.weight", "gate.weight"):
                 old = torch.cat([old, torch.zeros(len(old), plain)], dim=1)
@@ -228,7 +228,7 @@ class Run:
         """All sources' flights; seeds per source."""
         r = self.recipe
         found = [
-            data.prepare(self.plant_id, r.sources, i, r.shape, self.progress.model, r.filter, of_source)
+            data.prepare(self.plant_id, r.sources, i, r.shape, self.progress.model, r.filters, of_source)
             for i, of_source in enumerate(seeds)
         ]
         return data.joined([f for f, _ in found]), [record for _, record in found]
@@ -357,7 +357,7 @@ class Run:
             options=[dict(plant.options) for plant in self.plants], processes=[s.process for s in r.sources],
             **weights.names(self.plant),  # type: ignore[arg-type]
             task="both",
-            shape={**r.shape._asdict(), "hidden": r.hidden}, filter=r.filter,
+            shape={**r.shape._asdict(), "hidden": r.hidden}, filters=list(r.filters),
             seeds={
                 "training": [self.first, self.first + r.identify + fresh * r.candidates - 1],
                 "validation": [VALIDATION, VALIDATION + r.validation - 1],

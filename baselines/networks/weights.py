@@ -43,7 +43,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         labels, observed, estimated: Names, in order.
         task: "isolation", "identification" or "both".
         shape: What the network is made of.
-        filter: The diagnoser whose word it hears, or "".
+        filters: The diagnosers whose words it hears.
         seeds: First and last seed of the training, validation and calibration flights.
         budget: What was used: flights, samples, steps, seconds.
         curve: The training curve: one entry per validation.
@@ -65,7 +65,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     estimated: list[str]
     task: str
     shape: dict[str, Any]
-    filter: str = ""
+    filters: list[str] = []
     seeds: dict[str, list[int]]
     budget: dict[str, float]
     curve: list[dict[str, Any]]
