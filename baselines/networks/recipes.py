@@ -23,7 +23,7 @@ RECIPES = {
     ),
     "CMGSatellite": Recipe(
         sources=BOTH, shape=Shape(stride=20, lags=2, degree=2, effects=2, every=2),
-        identify=100, flights=2048, chunk=64, passes=8, validation=60, validate=16,
+        identify=100, flights=6144, chunk=64, passes=8, validation=60, validate=32,
     ),
 }  # fmt: skip
 HEARD = {  # the filters that residual_net hears, and training flights per process: filters cost more than networks

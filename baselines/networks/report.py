@@ -16,7 +16,7 @@ from fdi_gym.evaluation import Row, suite_names, write_whole
 from fdi_gym.leaderboard import markdown, read_row
 
 HOME = Path(__file__).parent.parent.parent / "leaderboards"
-LEARNED = ("sequence_net", "sequence_net_hard", "residual_net", "residual_net_hard", "ppo", "ppo_identification")
+LEARNED = ("sequence_net", "residual_net", "ppo", "ppo_identification")
 REFERENCE = ("bayes_bank", "switching_bayes_bank", "hypothesis_bank")  # this package's own Bayesian banks, of no paper
 FLOOR = ("null", "random")
 
