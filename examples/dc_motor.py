@@ -2,9 +2,10 @@
 
     python examples/dc_motor.py
 
-registers `DCMotor-Faults-v0` and evaluates every diagnoser that can run on it: augmented Kalman filters with five decision
+evaluates every diagnoser that can run on it: augmented Kalman filters with five decision
 logics, adaptive unscented filters, two-stage filter, interacting models, GLR test, oracle. They need nothing but the
-declaration below. Copy it for a plant of yours.
+declaration below. Importing this file registers `DCMotor-Faults-v0`, so that `gym.make("dc_motor:DCMotor-Faults-v0")` and
+`fdi-gym train sequence_net dc_motor:DCMotor` find it. Copy it for a plant of yours.
 """
 
 import tempfile
@@ -121,10 +122,12 @@ def plant() -> Plant:
     )  # fmt: skip
 
 
+ENV = fdi_gym.register_plant(ID, f"{__name__}:plant")
+
+
 def main() -> None:
-    env = fdi_gym.register_plant(ID, f"{plant.__module__}:plant")
     suite = Suite(
-        name="dc-motor", description="a DC motor", env=env, plant=ID, options={}, scenario="standard", mismatch=None,
+        name="dc-motor", description="a DC motor", env=ENV, plant=ID, options={}, scenario="standard", mismatch=None,
         first_seed=1_000_000, episodes=20, settings={},
     ).sealed()  # fmt: skip
     names, _ = applicable(suite, suite.build(), list(diagnosers()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -158,7 +159,7 @@ def train(
 
     Args:
         method: Name of a trainer, or "module:function".
-        plant: Plant or environment id.
+        plant: Plant or environment id; "module:id" where the module registers it.
         budget: How much to train: flights per process, or for reinforcement learning agent steps. Default: the recipe's.
         seed: Of the run.
         work: Folder of runs: checkpoint, tensorboard log, weights and card.
@@ -169,7 +170,10 @@ def train(
 
     from fdi_gym.training import find_trainer
 
-    path = find_trainer(method).train(plant.split("-Faults-v")[0], budget=budget, seed=seed, work=work, threads=threads)
+    module, _, plant_id = plant.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    path = find_trainer(method).train(plant_id.split("-Faults-v")[0], budget=budget, seed=seed, work=work, threads=threads)
     for suffix in (".safetensors", ".json"):
         if output is not None:
             output.mkdir(parents=True, exist_ok=True)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import sys
 from pathlib import Path
 
 import pytest
 
-import fdi_gym
 from fdi_gym.estimation import calibration, unknown_inputs
 from fdi_gym.estimation.prior import flights_of
 from fdi_gym.plant import Plant, load_plant, plant_sources
@@ -17,8 +17,7 @@ from fdi_gym.simulation import simulate
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "examples"))
 PLANTS = list(plant_sources())
-if "DCMotor" not in PLANTS:
-    fdi_gym.register_plant("DCMotor", "dc_motor:plant")
+importlib.import_module("dc_motor")  # registers itself
 
 build = functools.cache(load_plant)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import joblib
 import numpy as np
@@ -14,7 +14,7 @@ from baselines.networks.identification import Model, Shape
 from fdi_gym.diagnosis import Diagnosis, make_diagnoser, run, told
 from fdi_gym.faults import draw
 from fdi_gym.metrics import scored_samples
-from fdi_gym.plant import Array, Plant, load_plant
+from fdi_gym.plant import Array, Plant, PlantSource, add_plant_source, load_plant, plant_sources
 from fdi_gym.simulation import Record, simulate
 
 # the first seed of each split, which ends where the next begins
@@ -102,6 +102,12 @@ def words(plant_id: str, source: Source, filters: Sequence[str], obs: Array, per
     return [_words(plant_of(plant_id, source), source, name, obs, period) for name in filters]
 
 
+def _elsewhere(known: PlantSource, plant_id: str, *arguments: Any) -> list[Array]:
+    """`words` in a worker process, which may not know the plant yet."""
+    add_plant_source(plant_id, known)
+    return words(plant_id, *arguments)
+
+
 def _words(plant: Plant, source: Source, name: str, obs: Array, period: int) -> Array:
     said = run(make_diagnoser(name, plant, **told(name, source.process)), obs, signals=True)
     parts = [getattr(said, name) for name in ("alarm", "mode", "theta", "theta_std", "mode_probs")]
@@ -139,8 +145,9 @@ def prepare(
     own = np.concatenate([ident.features(plant, shape, model, z[i]) for i in pieces])
     seen = [own, context(process, len(sources), T)]
     if filters:
-        task = joblib.delayed(words)
-        heard = joblib.Parallel(n_jobs=-1)(task(plant_id, source, filters, record.obs[i], shape.period) for i in pieces)
+        known = plant_sources()[plant_id]
+        tasks = (joblib.delayed(_elsewhere)(known, plant_id, source, filters, record.obs[i], shape.period) for i in pieces)
+        heard = joblib.Parallel(n_jobs=-1)(tasks)
         seen.append(np.concatenate([np.concatenate(piece, axis=2) for piece in heard]))  # type: ignore[arg-type]
     scoring = plant.process(source.process).scoring
     scored = np.stack([scored_samples(record.label[i], int(record.length[i]), scoring) for i in range(n)])

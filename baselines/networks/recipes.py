@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from baselines.networks import reinforcement
+from baselines.networks import flights as data
+from baselines.networks import reinforcement, weights
 from baselines.networks.flights import Source
 from baselines.networks.identification import Shape
 from baselines.networks.supervised import Recipe, Run
 
 BOTH = (Source("standard", {}), Source("hard", {}))
-GENERAL = Recipe(sources=(Source("standard", {}),), shape=Shape(stride=5, lags=6, degree=2))
 RECIPES = {
     "B747Lateral": Recipe(sources=BOTH, shape=Shape(stride=4, lags=12, degree=1), flights=6144, validate=16),
     "HUAVHover": Recipe(
@@ -45,13 +45,21 @@ POLICIES = {
 }
 
 
+def general(plant_id: str) -> Recipe:
+    """A recipe for any plant: for its standard and hard processes, or whichever it has beside the healthy one."""
+    processes = data.plant_of(plant_id, STANDARD).processes
+    found = [name for name in ("standard", "hard") if name in processes] or [n for n in processes if n != "fault-free"]
+    return Recipe(sources=tuple(Source(name, {}) for name in found), shape=Shape(stride=5, lags=6, degree=2))
+
+
 def train(
     method: str, plant_id: str, *, budget: int | None = None, seed: int = 0, work: Path = Path("runs"), threads: int = 1
 ) -> Path:
     """Train a supervised network; the path of its weights.
 
     Args:
-        method: "sequence_net", or "residual_net", which hears the plant's filters and starts from the other's weights.
+        method: "sequence_net", or "residual_net", which hears the plant's filters and starts from the other's weights:
+            those in the folder of runs, or else the committed ones.
         plant_id: The plant.
         budget: Training flights per process. Default: the recipe's.
         seed: Of the run; each has training seeds of its own.
@@ -61,16 +69,19 @@ def train(
     Raises:
         ValueError: There is no network to start from, or the folder holds another run.
     """
-    recipe = RECIPES.get(plant_id, GENERAL)
+    recipe, base = RECIPES.get(plant_id) or general(plant_id), None
     if method == "residual_net":
         filters, flights = HEARD.get(plant_id, GENERAL_HEARD)
         recipe = replace(
             recipe, filters=filters, identify=100, flights=flights, chunk=flights, passes=20, validate=2, rate=1e-3
         )
+        file = f"sequence_net-{plant_id}.safetensors"
+        own = work / f"sequence_net-{plant_id}-{seed}" / file
+        base = own if own.exists() else weights.WEIGHTS / file
     if budget is not None:
         recipe = replace(recipe, flights=budget, chunk=min(recipe.chunk, budget))
     where = {"seed": seed, "work": work / f"{method}-{plant_id}-{seed}", "threads": threads}
-    return Run(method, plant_id, recipe, command=_command(method, plant_id, budget, seed), **where).run()
+    return Run(method, plant_id, recipe, base=base, command=_command(method, plant_id, budget, seed), **where).run()
 
 
 def train_ppo(

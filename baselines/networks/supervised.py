@@ -95,6 +95,7 @@ class Run:
         seed: Of everything.
         work: Folder of the checkpoint and the tensorboard log.
         command: For the card.
+        base: Weights of the network that hears no filter, for one that does.
         threads: Of torch on a processor; the bytes of the weights depend on it.
 
     Raises:
@@ -102,11 +103,12 @@ class Run:
     """
 
     def __init__(
-        self, method: str, plant_id: str, recipe: Recipe, *, seed: int, work: Path, command: str = "", threads: int = 1
+        self, method: str, plant_id: str, recipe: Recipe, *, seed: int, work: Path, command: str = "",
+        base: Path | None = None, threads: int = 1,
     ):  # fmt: skip
         torch.set_num_threads(threads)
         self.method, self.plant_id, self.recipe, self.seed, self.command = method, plant_id, recipe, seed, command
-        self.work, self.checkpoint = work, work / "checkpoint.safetensors"
+        self.base, self.work, self.checkpoint = base, work, work / "checkpoint.safetensors"
         self.plants = [data.plant_of(plant_id, source) for source in recipe.sources]
         self.plant = self.plants[0]
         self.first = TRAINING + PER_SEED * seed
@@ -140,10 +142,9 @@ class Run:
         records = [data.fly(p, s, seeds) for p, s in zip(self.plants, recipe.sources, strict=True)]
         prior = np.stack([np.bincount(r.label.ravel(), minlength=len(self.plant.labels)) / r.label.size for r in records])
         if recipe.filters:
-            path = weights.WEIGHTS / f"sequence_net-{self.plant_id}.safetensors"
-            if not path.exists():
-                raise ValueError(f"a network that hears a filter starts from {path.name}: train sequence_net first")
-            tensors, _ = weights.read(path, self.plant)
+            if self.base is None or not self.base.exists():
+                raise ValueError(f"a network that hears filters starts from one without: train sequence_net {self.plant_id}")
+            tensors, _ = weights.read(self.base, self.plant)
             model = Model(*(tensors[f"model.{name}"] for name in Model._fields))
             self.make(model)
             self.start_from(tensors)
