@@ -23,6 +23,7 @@ from fdi_gym.diagnosis import NotApplicableError, make_diagnoser, run
 from fdi_gym.evaluation import diagnose, load_suite, suite_names
 from fdi_gym.leaderboard import read_row
 from fdi_gym.plant import load_plant
+from fdi_gym.testing import check_diagnoser
 from fdi_gym.training import find_trainer, trainers
 
 TINY = Recipe(
@@ -124,6 +125,46 @@ def test_loss_falls_on_a_fixed_batch():
         optimiser.step()
         values.append(float(value.detach()))
     assert values[-1] < 0.4 * values[0]
+
+
+def test_an_untrained_network_believes_the_filters_it_hears():
+    torch.manual_seed(0)
+    net = SequenceNetwork(10 + 4 + 6, 3, 2, 16, words=(4, 6))
+    x = torch.zeros(2, 5, 20)
+    plain = net(x)[0]
+    x[0, :, 10 + 1] = x[0, :, 14 + 1] = x[1, :, 10 + 2] = 1.0  # both filters say 1; the first says 2, the other nothing
+    net.value.weight.data[:, 10:] = net.gate.weight.data[:, 10:] = net.join.weight.data[:, 10:20] = 0.0
+    gain = net(x)[0] - plain
+    assert torch.allclose(gain[0], torch.tensor([0.0, 3.0, 0.0]), atol=1e-5)
+    assert torch.allclose(gain[1], torch.tensor([0.0, 0.0, 1.5]), atol=1e-5)
+
+
+def test_a_network_that_hears_starts_from_one_that_does_not_on_any_plant(tmp_path):
+    recipe = dataclasses.replace(
+        recipes.general("DCMotor"), flights=8, identify=8, chunk=8, passes=1, validation=4, hidden=8
+    )
+    hears = dataclasses.replace(recipe, filters=("augmented_ekf_cusum", "null"))
+    with pytest.raises(ValueError, match="train sequence_net DCMotor"):
+        Run("residual_net", "DCMotor", hears, seed=0, work=tmp_path / "none", base=tmp_path / "none.safetensors")
+    base = Run("sequence_net", "DCMotor", recipe, seed=0, work=tmp_path / "base").run()
+    run_ = Run("residual_net", "DCMotor", hears, seed=0, work=tmp_path / "run", base=base)
+    old, new = load_file(base), run_.network.state_dict()
+    assert np.array_equal(new["memory.weight_hh_l0"], old["network.memory.weight_hh_l0"])
+    assert not new["value.weight"][:, old["network.value.weight"].shape[1] :].any()
+    path = run_.run()
+    assert weights.read_card(path).filters == ["augmented_ekf_cusum", "null"]
+    check_diagnoser(lambda p, _: make_diagnoser("residual_net", p, path=str(path)), build("DCMotor"), samples=60)
+
+
+def test_a_network_is_told_the_process_and_takes_an_unknown_one_for_the_first(tiny):
+    plant = build("B747Lateral")
+    obs = flights.fly(plant, Source("standard", {}), range(VALIDATION, VALIDATION + 2)).obs[:, :200]
+    first, same, other = (
+        run(make_diagnoser("sequence_net", plant, path=str(tiny), process=name), obs)
+        for name in ("standard", "gust", "hard")
+    )
+    assert np.array_equal(first.mode_probs, same.mode_probs)
+    assert not np.allclose(first.mode_probs, other.mode_probs)
 
 
 @pytest.mark.parametrize("stop", [1, 3])
