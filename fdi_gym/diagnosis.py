@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi_gym.plant import Array, Plant
+from fdi_gym.plant import Array, Plant, contiguous
 
 
 class Diagnosis(NamedTuple):
@@ -238,7 +238,7 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
     def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
         inner, last, last_obs, lost = state
         n = len(lost)
-        obs = np.asarray(obs, float)
+        obs = contiguous(obs)
         if obs.shape != (n, width):
             raise ValueError(
                 f"obs has the shape {(n, width)} ({', '.join(s.name for s in plant.observed)}), not {obs.shape}"

@@ -25,6 +25,12 @@ from fdi_gym.faults import FaultProcess, FaultScenario, ThetaTable, theta_table
 Array = np.ndarray
 
 
+def contiguous(a: Any) -> Array:
+    """As the compiled kernels take an array: float64, in C order and writable; a copy only of one that is not."""
+    a = np.ascontiguousarray(a, float)
+    return a if a.flags.writeable else a.copy()
+
+
 class Signal(NamedTuple):
     """One entry of a vector: its name, unit and range.
 
@@ -217,7 +223,7 @@ class Plant:
     @functools.cached_property
     def nominal_p(self) -> Array:
         """The physical parameters of the model that diagnosers get."""
-        return np.ascontiguousarray(self.physical({}), float)
+        return contiguous(self.physical({}))
 
     @functools.cached_property
     def trim_command(self) -> Array:
@@ -307,13 +313,13 @@ class Plant:
 
     def _rows(self, value: Array | None, default: Array) -> Array:
         rows = default if value is None else np.asarray(value, float)
-        return np.ascontiguousarray(rows.reshape(math.prod(rows.shape[:-1]), rows.shape[-1]))  # also of zero width
+        return contiguous(rows.reshape(math.prod(rows.shape[:-1]), rows.shape[-1]))  # also of zero width
 
     def _rows_of(self, t: Any, x: Array, u: Array, theta: Any, d: Any, p: Any, width: int) -> tuple[Array, ...]:
         """The arguments of a generic kernel from those of `propagate`, and an array for its output."""
-        points = np.ascontiguousarray(x.reshape(-1, x.shape[-1]))
+        points = contiguous(x.reshape(-1, x.shape[-1]))
         return (
-            np.ascontiguousarray(np.atleast_1d(np.asarray(t, float))),
+            contiguous(np.atleast_1d(t)),
             points,
             self._rows(u, self.trim_command),
             self._rows(theta, self.nominal_theta),

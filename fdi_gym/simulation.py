@@ -13,7 +13,7 @@ import numpy as np
 
 from fdi_gym import kernels
 from fdi_gym.faults import FaultScenario
-from fdi_gym.plant import Plant
+from fdi_gym.plant import Plant, contiguous
 
 Array = np.ndarray
 
@@ -77,10 +77,10 @@ def simulate(plant: Plant, scenarios: Sequence[FaultScenario], noise: Sequence[t
         flown = kernels.simulate(
             *plant.addresses, plant.dt, plant.substeps,
             plant.trim_state if scenario.x0 is None else np.array(scenario.x0, float),
-            plant.trim_command, np.ascontiguousarray(plant.c0, float), np.ascontiguousarray(plant.q, float),
-            np.ascontiguousarray(plant.reference(scenario), float), np.ascontiguousarray(d, float),
-            *plant.theta_table(scenario), np.ascontiguousarray(w, float), np.ascontiguousarray(v, float), sensor_range,
-            np.ascontiguousarray(plant.physical(scenario.physical), float) if scenario.physical else plant.nominal_p,
+            plant.trim_command, contiguous(plant.c0), contiguous(plant.q),
+            contiguous(plant.reference(scenario)), contiguous(d),
+            *plant.theta_table(scenario), contiguous(w), contiguous(v), sensor_range,
+            contiguous(plant.physical(scenario.physical)) if scenario.physical else plant.nominal_p,
             plant.nominal_theta, int(plant.true_feedback), state[i], obs[i], theta[i],
         )  # fmt: skip
         length[i], terminated[i] = abs(flown), flown < 0

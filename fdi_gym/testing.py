@@ -203,7 +203,8 @@ def check_diagnoser(
         samples: How many samples of them.
     """
     scenarios = [draw(plant.processes["standard"], seed + i) for i in range(4)]
-    obs = simulate(plant, scenarios).obs[:, :samples]
+    obs = simulate(plant, scenarios).obs[:, :samples].copy()
+    obs.setflags(write=False)  # as worker processes get large arrays
 
     def fresh(which: Sequence[int]) -> Diagnoser:
         raw = build(plant, [scenarios[i] for i in which])

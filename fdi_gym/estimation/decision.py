@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi_gym.diagnosis import Diagnoser, Diagnosis
-from fdi_gym.plant import Array, FaultMode, Plant
+from fdi_gym.plant import Array, FaultMode, Plant, contiguous
 
 
 class Decision(NamedTuple):
@@ -74,7 +74,7 @@ def nearest_of(I: Array, Iz: Array, sets: Manifolds) -> tuple[Array, Array]:  # 
     G = np.swapaxes(D, 1, 2) @ I[:, None] @ D  # (n, h, f, f)
     G = G if len(G) == len(g) else np.repeat(G, len(g), axis=0)  # the kernel does not repeat the only row of I
     m, value = np.zeros_like(g), np.empty_like(base)
-    kernels.box_minimum(*(np.ascontiguousarray(a) for a in (G, g, sets.low, sets.high)), m, value)
+    kernels.box_minimum(*(contiguous(a) for a in (G, g, sets.low, sets.high)), m, value)
     return base + value, m
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-Array = np.ndarray
+from fdi_gym.plant import Array, contiguous
 
 
 def T(M: Array) -> Array:
@@ -29,10 +29,7 @@ def solve(S: Array, M: Array) -> Array:
     from fdi_gym import kernels
 
     outer = S.shape[:-2] if S.shape[:-2] == M.shape[:-2] else np.broadcast_shapes(S.shape[:-2], M.shape[:-2])
-    left, right = (
-        np.ascontiguousarray(a if a.shape[:-2] == outer else np.broadcast_to(a, (*outer, *a.shape[-2:])), float)
-        for a in (S, M)
-    )
+    left, right = (contiguous(a if a.shape[:-2] == outer else np.broadcast_to(a, (*outer, *a.shape[-2:]))) for a in (S, M))
     out = np.empty(right.shape)
     kernels.solve(*(a.reshape(-1, *a.shape[-2:]) for a in (left, right, out)))
     return out
