@@ -33,14 +33,11 @@ HEARD = {  # the filter that residual_net hears, and training flights per proces
     "CMGSatellite": ("mekf", 100),
 }
 
-STANDARD = Source("standard", {})
 POLICIES = {
-    "B747Lateral": reinforcement.Recipe(source=STANDARD, decision_period=5, length=32, decisions=300_000, updates=4),
-    "HUAVHover": reinforcement.Recipe(
-        source=Source("standard", {"kappa": 0.3}), decision_period=5, length=16, decisions=200_000, updates=4
-    ),
-    "MissilePitch": reinforcement.Recipe(source=STANDARD, decision_period=10, length=16, decisions=200_000, updates=4),
-    "CMGSatellite": reinforcement.Recipe(source=STANDARD, decision_period=50, length=16, decisions=200_000, updates=4),
+    "B747Lateral": {"steps": 300, "decisions": 2_000_000},
+    "HUAVHover": {"steps": 200, "decisions": 2_000_000},
+    "MissilePitch": {"steps": 200, "decisions": 2_000_000},
+    "CMGSatellite": {"steps": 250, "decisions": 2_000_000},
 }
 
 
@@ -72,6 +69,12 @@ def train(
     return Run(method, plant_id, recipe, command=_command(method, plant_id, budget, seed), **where).run()
 
 
+def policy_recipe(plant_id: str) -> reinforcement.Recipe:
+    """How a plant's policy is trained: on the processes of its supervised network, seeing the same features."""
+    like = RECIPES.get(plant_id, GENERAL)
+    return reinforcement.Recipe(sources=like.sources, shape=like.shape, identify=like.identify, **POLICIES.get(plant_id, {}))
+
+
 def train_ppo(
     method: str, plant_id: str, *, budget: int | None = None, seed: int = 0, work: Path = Path("runs"), threads: int = 1
 ) -> Path:
@@ -88,7 +91,7 @@ def train_ppo(
     Raises:
         ValueError: The folder holds another run.
     """
-    recipe = POLICIES.get(plant_id, reinforcement.Recipe(source=STANDARD))
+    recipe = policy_recipe(plant_id)
     if method == "ppo_identification":
         recipe = replace(recipe, task="identification", entropy=0.0)
     if budget is not None:
