@@ -34,10 +34,10 @@ HEARD = {  # the filter that residual_net hears, and training flights per proces
 }
 
 POLICIES = {
-    "B747Lateral": {"steps": 300, "decisions": 2_000_000},
-    "HUAVHover": {"steps": 200, "decisions": 2_000_000},
-    "MissilePitch": {"steps": 200, "decisions": 2_000_000},
-    "CMGSatellite": {"steps": 250, "decisions": 2_000_000},
+    "B747Lateral": {"steps": 299, "decisions": 2_000_000},
+    "HUAVHover": {"steps": 199, "decisions": 2_000_000},
+    "MissilePitch": {"steps": 199, "decisions": 2_000_000},
+    "CMGSatellite": {"steps": 249, "decisions": 2_000_000},
 }
 
 
@@ -72,7 +72,7 @@ def train(
 def policy_recipe(plant_id: str) -> reinforcement.Recipe:
     """How a plant's policy is trained: on the processes of its supervised network, seeing the same features."""
     like = RECIPES.get(plant_id, GENERAL)
-    return reinforcement.Recipe(sources=like.sources, shape=like.shape, identify=like.identify, **POLICIES.get(plant_id, {}))
+    return reinforcement.Recipe(sources=like.sources, shape=like.shape, identify=like.identify, candidates=like.candidates, **POLICIES.get(plant_id, {}))
 
 
 def train_ppo(

@@ -54,11 +54,13 @@ class Recipe:
         task: "isolation" or "identification".
         patience: Of the delay-aware reward, in decisions.
         decisions: The budget.
-        envs: Environments side by side. Their flights begin together, so `steps` should span whole flights.
-        steps: Decisions of each per update.
+        candidates: Seeds per training flight, from which those are taken that show rare labels.
+        envs: Environments side by side. Their flights begin together, so `steps` should span whole flights ...
+        steps: Decisions of each per update; ... but not their very end, where new flights would begin for nothing.
         updates: Updates per leg.
         epochs: Passes over an update's decisions.
         batch: Decisions per gradient step.
+        clip: How far an update may move the ratio of old and new probabilities of a decision from 1.
         rate: Learning rate at the start; it falls to a tenth.
         hidden: Widths of the two layers.
         entropy: Weight of the entropy.
@@ -72,11 +74,13 @@ class Recipe:
     task: str = "isolation"
     patience: float = 10.0
     decisions: int = 1_000_000
+    candidates: int = 1
     envs: int = 64
     steps: int = 250
     updates: int = 1
     epochs: int = 4
     batch: int = 512
+    clip: float = 0.2
     rate: float = 1e-3
     hidden: int = 128
     entropy: float = 0.003
@@ -124,9 +128,21 @@ class Run:
         """Identify the plant, and make a new policy."""
         seeds = range(self.first, self.first + self.recipe.identify)
         records = [data.fly(p, s, seeds) for p, s in zip(self.plants, self.recipe.sources, strict=True)]
-        labels = len(self.plant.labels)
-        share = np.stack([np.bincount(r.label.ravel(), minlength=labels) / r.label.size for r in records])
+        share = np.stack([self.share_of(index) for index in range(len(self.plants))])
         self.make(data.identified(self.plants, self.recipe.shape, records), share)
+
+    def share_of(self, index: int) -> Array:
+        """Share of each label in the first training flights of a process, as they are planned."""
+        plant, source = self.plants[index], self.recipe.sources[index]
+        seeds = [seed for leg in range(4) for seed in self.seeds_of(leg, index)]
+        rows = [plant.label_rows(data.draw(plant.process(source.process), seed)) for seed in seeds]
+        return np.bincount(np.concatenate(rows), minlength=len(plant.labels)) / sum(map(len, rows))
+
+    def seeds_of(self, leg: int, index: int) -> list[int]:
+        """The seeds of the flights that a leg begins with."""
+        r = self.recipe
+        first = self.first + r.identify + leg * r.envs * r.candidates
+        return data.selected(self.plants[index], r.sources[index], range(first, first + r.envs * r.candidates), r.envs)
 
     def make(self, model: Model, share: Array) -> None:
         """Environments and a new policy, from the model and each process's share (processes, labels) of each label."""
@@ -135,8 +151,8 @@ class Run:
         self.venvs = [self.environments(index) for index in range(len(r.sources))]
         self.agent = PPO(
             "MlpPolicy", self.venvs[0], learning_rate=r.rate, n_steps=r.steps, batch_size=r.batch, n_epochs=r.epochs,
-            gamma=0.0, gae_lambda=0.0, ent_coef=r.entropy, seed=self.seed,
-            device="auto" if torch.cuda.is_available() else "cpu",
+            gamma=0.0, gae_lambda=0.0, clip_range=r.clip, ent_coef=r.entropy,
+            seed=self.seed, device="auto" if torch.cuda.is_available() else "cpu",
             policy_kwargs={"net_arch": [r.hidden, r.hidden], "log_std_init": -1.0},
         )  # fmt: skip
 
@@ -188,8 +204,9 @@ class Run:
         """Fly and learn; the mean reward per decision."""
         r, agent = self.recipe, self.agent
         agent.set_random_seed(int(np.random.SeedSequence([self.seed, self.leg]).generate_state(1)[0]))
-        agent.set_env(self.venvs[self.leg % len(self.venvs)])  # the leg begins with a reset
-        agent.get_env().seed(self.first + 1000 + self.leg * r.envs)  # type: ignore[union-attr]
+        index = self.leg % len(self.venvs)
+        self.venvs[index]._seeds = list(self.seeds_of(self.leg, index))
+        agent.set_env(self.venvs[index])  # the leg begins with a reset
         agent.learning_rate = r.rate * (1 - 0.9 * self.leg / self.legs)
         agent._setup_lr_schedule()
         agent.learn(self.per_leg, reset_num_timesteps=False)
@@ -254,7 +271,7 @@ class Run:
         """Write the actor and its card."""
         r = self.recipe
         revision, versions = weights.made_with()
-        last = self.first + 1000 + self.legs * r.envs - 1
+        last = self.first + r.identify + self.legs * r.envs * r.candidates - 1
         card = weights.Card(
             method=self.method, env=self.plant.env_id, plant=self.plant_id,
             options=[dict(plant.options) for plant in self.plants], processes=[s.process for s in r.sources],
