@@ -33,11 +33,11 @@ HEARD = {  # the filter that residual_net hears, and training flights per proces
     "CMGSatellite": ("mekf", 100),
 }
 
-POLICIES = {
-    "B747Lateral": {"steps": 299, "decisions": 2_000_000},
-    "HUAVHover": {"steps": 199, "decisions": 2_000_000},
-    "MissilePitch": {"steps": 199, "decisions": 2_000_000},
-    "CMGSatellite": {"steps": 249, "decisions": 2_000_000},
+POLICIES = {  # steps: decisions of a flight, less one
+    "B747Lateral": {"steps": 299, "decisions": 1_000_000},
+    "HUAVHover": {"steps": 199, "decisions": 1_000_000},
+    "MissilePitch": {"steps": 199, "decisions": 800_000},
+    "CMGSatellite": {"steps": 249, "decisions": 600_000, "candidates": 4, "epochs": 6, "validate": 6},
 }
 
 
@@ -72,7 +72,8 @@ def train(
 def policy_recipe(plant_id: str) -> reinforcement.Recipe:
     """How a plant's policy is trained: on the processes of its supervised network, seeing the same features."""
     like = RECIPES.get(plant_id, GENERAL)
-    return reinforcement.Recipe(sources=like.sources, shape=like.shape, identify=like.identify, candidates=like.candidates, **POLICIES.get(plant_id, {}))
+    shared = {name: getattr(like, name) for name in ("sources", "shape", "identify", "candidates")}
+    return reinforcement.Recipe(**shared | POLICIES.get(plant_id, {}))
 
 
 def train_ppo(
@@ -93,7 +94,7 @@ def train_ppo(
     """
     recipe = policy_recipe(plant_id)
     if method == "ppo_identification":
-        recipe = replace(recipe, task="identification", entropy=0.0)
+        recipe = replace(recipe, task="identification", entropy=0.0, decisions=recipe.decisions // 2)
     if budget is not None:
         recipe = replace(recipe, decisions=budget)
     where = {"seed": seed, "work": work / f"{method}-{plant_id}-{seed}", "threads": threads}
