@@ -34,7 +34,7 @@ HEARD = {  # the filter that residual_net hears, and training flights per proces
 }
 
 POLICIES = {  # steps: decisions of a flight, less one
-    "B747Lateral": {"steps": 299, "decisions": 600_000, "clip": 0.2, "entropy": 0.003},
+    "B747Lateral": {"steps": 299, "decisions": 600_000, "entropy": 0.003},
     "HUAVHover": {"steps": 199, "decisions": 1_000_000},
     "MissilePitch": {"steps": 199, "decisions": 800_000},
     "CMGSatellite": {"steps": 249, "decisions": 600_000, "candidates": 4, "epochs": 6, "validate": 6},

@@ -60,7 +60,6 @@ class Recipe:
         updates: Updates per leg.
         epochs: Passes over an update's decisions.
         batch: Decisions per gradient step.
-        clip: How far an update may move the ratio of old and new probabilities of a decision from 1.
         rate: Learning rate at the start; it falls to a tenth.
         hidden: Widths of the two layers.
         entropy: Weight of the entropy.
@@ -80,7 +79,6 @@ class Recipe:
     updates: int = 1
     epochs: int = 4
     batch: int = 512
-    clip: float = 0.4
     rate: float = 1e-3
     hidden: int = 128
     entropy: float = 0.01
@@ -151,7 +149,7 @@ class Run:
         self.venvs = [self.environments(index) for index in range(len(r.sources))]
         self.agent = PPO(
             "MlpPolicy", self.venvs[0], learning_rate=r.rate, n_steps=r.steps, batch_size=r.batch, n_epochs=r.epochs,
-            gamma=0.0, gae_lambda=0.0, clip_range=r.clip, ent_coef=r.entropy, seed=self.seed,
+            gamma=0.0, gae_lambda=0.0, ent_coef=r.entropy, seed=self.seed,
             device="auto" if torch.cuda.is_available() else "cpu",
             policy_kwargs={"net_arch": [r.hidden, r.hidden], "log_std_init": -1.0},
         )  # fmt: skip
