@@ -44,7 +44,7 @@ class IdentifiedFeatures(VectorWrapper):
             raise ValueError("features are followed through autoreset_mode='SameStep' only")
         self.single_observation_space = Box(-np.inf, np.inf, model.mean.shape, np.float32)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
-        self._of = plant, shape, model
+        self._plant, self._shape, self._model = plant, shape, model
         scaled = space.dtype == np.float32
         self._scale = np.array([s.scale if scaled else 1.0 for s in plant.observed])
         self._offset = np.array([s.nominal if scaled else 0.0 for s in plant.observed])
@@ -71,19 +71,19 @@ class IdentifiedFeatures(VectorWrapper):
         """Step every environment."""
         block, rewards, terminated, truncated, infos = self.env.step(actions)
         ended = terminated | truncated
-        m, last, flown = self._of[1].period, block, np.full(self.num_envs, self._of[1].period)
-        if ended.any():
-            which = np.flatnonzero(ended)
+        which, m, last = np.flatnonzero(ended), self._shape.period, block
+        flown = np.full(self.num_envs, m)  # samples since the last decision
+        if which.size:
             last = block.copy()
             last[which] = np.stack(list(infos["final_obs"][which]))
-            flown[which] = np.rint(infos["final_info"]["time"][which] / self._of[0].dt).astype(int) - self._k[which]
+            flown[which] = np.rint(infos["final_info"]["time"][which] / self._plant.dt).astype(int) - self._k[which]
             early = which[flown[which] == m - 1]  # the step is complete: its samples are at the end of the block
             last[early, :-1] = last[early, 1:]
         self._k += m
         shown = self._add(last)
         shown[flown < m - 1] = self._shown[flown < m - 1]
         self._shown = shown
-        if ended.any():
+        if which.size:
             final = np.empty(self.num_envs, dtype=object)
             final[which] = list(shown[which])
             infos = {**infos, "final_obs": final}
@@ -95,16 +95,17 @@ class IdentifiedFeatures(VectorWrapper):
 
     def _add(self, block: Array) -> Array:
         """Feed the newest period of samples (N, m, n_obs) after the first; the features of the step that it completes."""
-        shown, m = None, self._of[1].period
-        for k in range(1, m + 1):
-            self._stream, seen = ident.add(*self._of, self._stream, self._physical(block[:, k - 1]), k)
+        shown, model = None, (self._plant, self._shape, self._model)
+        for k in range(1, self._shape.period + 1):
+            self._stream, seen = ident.add(*model, self._stream, self._physical(block[:, k - 1]), k)
             shown = seen if seen is not None else shown
         assert shown is not None
         return shown.astype(np.float32)
 
     def _begin(self, begun: Array, block: Array) -> None:
         """Set the episodes that begin back to their first sample, which is all of their block."""
-        first, _ = ident.add(*self._of, self._fresh, self._physical(block[:, -1]), 0)
+        obs = self._physical(block[:, -1])
+        first, _ = ident.add(self._plant, self._shape, self._model, self._fresh, obs, 0)
         mixed = (np.where(begun.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(first, self._stream, strict=True))
         self._stream = Stream(*mixed)
         self._shown = np.where(begun[:, None], np.float32(0), self._shown)
