@@ -1,6 +1,7 @@
 """PPO through the bridge: its features, exact resume, the stored actor; and adapters show what environments show."""
 
 import gymnasium as gym
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -64,13 +65,20 @@ def test_the_stored_actor_is_the_policy(tiny):
         assert np.array_equal(said.mode_probs[:, k - 1], said.mode_probs[:, k + 98])
 
 
-def test_tensors_of_another_shape_are_refused(tiny, tmp_path):
+def test_tensors_or_a_card_of_another_shape_are_refused(tiny, tmp_path):
     tensors, card = weights.read_tensors(tiny), weights.read_card(tiny)
-    for name, other in (("model.V", None), ("model.W", tensors["model.W"][:, 1:]), ("layers.2.bias", np.zeros(6, "f4"))):
-        changed = {**tensors, name: other}
+
+    def refused(why, changed=tensors, card=card):
         weights.write(tmp_path / tiny.name, {k: v for k, v in changed.items() if v is not None}, card)
-        with pytest.raises(weights.RefusedError, match=name):
+        with pytest.raises(weights.RefusedError, match=why):
             make_diagnoser("ppo", build("B747Lateral"), path=str(tmp_path / tiny.name))
+
+    for name, other in (("model.V", None), ("model.W", tensors["model.W"][:, 1:]), ("layers.2.bias", np.zeros(6, "f4"))):
+        refused(name, {**tensors, name: other})
+    refused(
+        "every, lags of the shape",
+        card=msgspec.structs.replace(card, shape={"stride": 50, "degree": 1, "effects": 1, "hidden": 8}),
+    )
 
 
 def test_an_sb3_zip_is_refused(tiny, tmp_path):

@@ -31,6 +31,7 @@ def ppo(plant: Plant, *, method: str = "ppo", path: str = "") -> Diagnoser:
 
     Raises:
         NotApplicableError: No weights for this plant and its options, or no safetensors.
+        RefusedError: Weights or a card that are not what they should be.
     """
     weights, policy, ident = (network_module(name) for name in ("weights", "policy", "identification"))
     file = Path(path) if path else weights.WEIGHTS / f"{method}-{plant.id}.safetensors"
@@ -40,6 +41,8 @@ def ppo(plant: Plant, *, method: str = "ppo", path: str = "") -> Diagnoser:
         tensors, card = weights.read(file, plant)
     except weights.WrongPlantError as error:
         raise NotApplicableError(str(error)) from error
+    if missing := {*ident.Shape._fields, "hidden"} - card.shape.keys():
+        raise weights.RefusedError(f"{file.with_suffix('.json')} does not give {', '.join(sorted(missing))} of the shape")
     shape = ident.Shape(**{name: card.shape[name] for name in ident.Shape._fields})
     weights.check_tensors(file, tensors, policy.shapes(plant, shape, card.task, card.shape["hidden"]))
     model = ident.Model(*(tensors[f"model.{name}"] for name in ident.Model._fields))
