@@ -49,7 +49,7 @@ class IdentifiedFeatures(VectorWrapper):
         self._scale = np.array([s.scale if scaled else 1.0 for s in plant.observed])
         self._offset = np.array([s.nominal if scaled else 0.0 for s in plant.observed])
         self._fresh = ident.begin(plant, shape, env.num_envs)
-        self._stream, self._shown = self._fresh, np.zeros(self.observation_space.shape, np.float32)
+        self._stream, self._shown = self._fresh, np.zeros((env.num_envs, *model.mean.shape), np.float32)
         self._k = np.zeros(env.num_envs, np.int64)  # newest sample of each episode
 
     def reset(
