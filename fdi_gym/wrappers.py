@@ -1,4 +1,4 @@
-"""Wrappers for vector environments that learners want and Gymnasium lacks: past samples, short blocks, a reward for haste.
+"""Wrappers for vector environments that learners want and Gymnasium lacks: past samples, a reward for haste.
 
 All work in every autoreset mode and without a Python loop over environments.
 """
@@ -80,47 +80,6 @@ class VectorHistory(VectorWrapper):
 
     def _window(self) -> Array:
         return self._ring[:, (self._at - self._ago) % self._ring.shape[1]]
-
-
-class BlockSummary(VectorWrapper):
-    """Shows a block of samples (N, m, n) as its mean and its newest sample (N, 2, n), which costs a learner less.
-
-    Args:
-        env: A vector environment with a decision period above 1.
-
-    Raises:
-        ValueError: Observations are not blocks of samples.
-    """
-
-    def __init__(self, env: VectorEnv):
-        super().__init__(env)
-        space = env.single_observation_space
-        if not isinstance(space, Box) or len(space.shape) != 2:
-            raise ValueError(f"blocks of samples are summarised (decision_period above 1), not {space}")
-        low, high = (np.stack([bound[0], bound[0]]) for bound in (space.low, space.high))
-        self.single_observation_space = Box(low, high, dtype=space.dtype)  # type: ignore[arg-type]
-        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
-
-    def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
-        """Begin new episodes, in all environments or in those of `options["reset_mask"]`."""
-        obs, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
-        return _summary(obs), infos
-
-    def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Step every environment."""
-        obs, rewards, terminated, truncated, infos = self.env.step(actions)
-        if "final_obs" in infos:
-            final = infos["final_obs"].copy()
-            for i in np.flatnonzero(infos["_final_obs"]):
-                final[i] = _summary(final[i])
-            infos = {**infos, "final_obs": final}
-        return _summary(obs), rewards, terminated, truncated, infos
-
-
-def _summary(block: Array) -> Array:
-    return np.stack([block.mean(axis=-2), block[..., -1, :]], axis=-2)
 
 
 class DelayAwareReward(VectorWrapper):

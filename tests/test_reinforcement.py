@@ -1,6 +1,7 @@
-"""PPO through the bridge: runs resume exactly, a stored actor is its policy, adapters show what environments show."""
+"""PPO through the bridge: its features, exact resume, the stored actor; and adapters show what environments show."""
 
 import gymnasium as gym
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -9,19 +10,25 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
-from baselines.networks import weights
+from baselines.networks import identification, weights
 from baselines.networks.adapters import from_sb3, from_torch
-from baselines.networks.flights import VALIDATION, Source, fly
+from baselines.networks.flights import VALIDATION, Source, fly, identified
+from baselines.networks.identification import Shape
+from baselines.networks.observed import IdentifiedFeatures
 from baselines.networks.reinforcement import Recipe, Run
 from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.sb3 import FDIVecEnv, make_vec_env
+from fdi_gym.simulation import simulate
 from fdi_gym.testing import check_diagnoser
 from fdi_gym.wrappers import VectorHistory
 
+SOURCES = (Source("standard", {}), Source("hard", {}))
+SHAPE = Shape(stride=50, lags=2, degree=1, every=2)
 TINY = Recipe(
-    source=Source("standard", {}), decision_period=100, length=3, decisions=192, envs=8, steps=4, updates=2, epochs=1,
-    batch=16, hidden=8, validate=1, validation=4,
+    sources=SOURCES, shape=SHAPE, identify=10, decisions=192, envs=8, steps=4, updates=2, epochs=1, batch=16, hidden=8,
+    validate=1, validation=4,
 )  # fmt: skip
+FAST = {"B747Lateral": Shape(stride=4, lags=3, degree=1, every=2), "HUAVHover": Shape(stride=7, lags=2, degree=1)}
 
 
 def trained(folder, method="ppo", recipe=TINY, **arguments):
@@ -45,19 +52,37 @@ def test_a_resumed_run_ends_with_the_same_bytes(tiny, tmp_path):
 def test_the_stored_actor_is_the_policy(tiny):
     """What the stored actor says of a stream is what the policy says of the observations that it was trained on."""
     plant, run_ = build("B747Lateral"), Run("ppo", "B747Lateral", TINY, seed=0, work=tiny.parent)
-    venv = run_.model.get_env()
+    venv = run_.venvs[0]
     venv.seed(VALIDATION)
-    obs = venv.reset()
-    said = run(make_diagnoser("ppo", plant, path=str(tiny)), fly(plant, TINY.source, range(VALIDATION, VALIDATION + 8)).obs)
-    for k in range(0, 1200, 100):
-        with torch.no_grad():
-            probs = run_.model.policy.get_distribution(torch.from_numpy(obs)).distribution.probs.numpy()
-        assert np.allclose(probs, said.mode_probs[:, k], atol=1e-5)
+    venv.reset()
+    said = run(make_diagnoser("ppo", plant, path=str(tiny)), fly(plant, SOURCES[0], range(VALIDATION, VALIDATION + 8)).obs)
+    assert (said.mode[:, :99] == 0).all()
+    for k in range(100, 1200, 100):
         obs, _, _, _ = venv.step(np.zeros(8, int))
+        with torch.no_grad():
+            probs = run_.agent.policy.get_distribution(torch.from_numpy(obs)).distribution.probs.numpy()
+        assert np.allclose(probs, said.mode_probs[:, k - 1], atol=1e-5)
+        assert np.array_equal(said.mode_probs[:, k - 1], said.mode_probs[:, k + 98])
+
+
+def test_tensors_or_a_card_of_another_shape_are_refused(tiny, tmp_path):
+    tensors, card = weights.read_tensors(tiny), weights.read_card(tiny)
+
+    def refused(why, changed=tensors, card=card):
+        weights.write(tmp_path / tiny.name, {k: v for k, v in changed.items() if v is not None}, card)
+        with pytest.raises(weights.RefusedError, match=why):
+            make_diagnoser("ppo", build("B747Lateral"), path=str(tmp_path / tiny.name))
+
+    for name, other in (("model.V", None), ("model.W", tensors["model.W"][:, 1:]), ("layers.2.bias", np.zeros(6, "f4"))):
+        refused(name, {**tensors, name: other})
+    refused(
+        "every, lags of the shape",
+        card=msgspec.structs.replace(card, shape={"stride": 50, "degree": 1, "effects": 1, "hidden": 8}),
+    )
 
 
 def test_an_sb3_zip_is_refused(tiny, tmp_path):
-    Run("ppo", "B747Lateral", TINY, seed=0, work=tiny.parent).model.save(tmp_path / "model.zip")
+    Run("ppo", "B747Lateral", TINY, seed=0, work=tiny.parent).agent.save(tmp_path / "model.zip")
     (tmp_path / "model.zip").rename(tmp_path / "model.safetensors")
     with pytest.raises(weights.RefusedError, match="zip archive"):
         make_diagnoser("ppo", build("B747Lateral"), path=str(tmp_path / "model.safetensors"))
@@ -67,7 +92,65 @@ def test_a_policy_estimates(tmp_path):
     path = trained(tmp_path, "ppo_identification", Recipe(**{**vars(TINY), "task": "identification", "decisions": 64}))
     plant = build("B747Lateral")
     check_diagnoser(lambda p, _: make_diagnoser("ppo_identification", p, path=str(path)), plant, samples=240)
-    assert "rmse" in weights.read_card(path).curve[0]["accuracy"]
+    assert set(weights.read_card(path).curve[0]["accuracy"]) == {"standard rmse", "hard rmse"}
+
+
+@pytest.fixture(scope="module", params=FAST)
+def seen(request):
+    """A plant, the shape of a model and the model, identified from a few flights."""
+    plant, shape = build(request.param), FAST[request.param]
+    return plant, shape, identified([plant], shape, [fly(plant, SOURCES[0], range(40))])
+
+
+def observed(seen, n, **arguments):
+    """Environments that show features."""
+    plant, shape, model = seen
+    arguments = {
+        "units": "physical",
+        "decision_period": shape.period,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+        **arguments,
+    }
+    return IdentifiedFeatures(gym.make_vec(plant.env_id, num_envs=n, **arguments), plant, shape, model)
+
+
+@pytest.mark.parametrize("units", ["physical", "scaled"])
+def test_features_are_those_of_each_flight_alone(seen, units):
+    """Also across the ends of episodes, some of which come early (HUAVHover), and in `final_obs`."""
+    plant, shape, model = seen
+    n, m, envs = 3, shape.period, observed(seen, 3, units=units)
+    close = {"atol": 1e-6 if units == "physical" else 1e-4, "rtol": 1e-6}
+
+    def alone(i):
+        """The features of the flight that environment i is on, with those before the first step: (T + 1, n_features)."""
+        record = simulate(plant, [envs.unwrapped.scenarios[i]])
+        obs = record.obs[:, : int(record.length[0]) + 1]
+        steps = identification.features(plant, shape, model, identification.blocks(plant, obs, shape.stride))[0]
+        return np.concatenate([np.zeros_like(steps[:1]), steps])
+
+    obs, _ = envs.reset(seed=VALIDATION)
+    assert obs.dtype == np.float32
+    flights, j, ends = [alone(i) for i in range(n)], np.zeros(n, int), 0
+    for _ in range(2500 // m):
+        obs, _, terminated, truncated, infos = envs.step(np.zeros(n, int))
+        j += 1
+        for i in range(n):
+            if terminated[i] or truncated[i]:
+                assert np.allclose(infos["final_obs"][i], flights[i][-1], **close)
+                flights[i], j[i], ends = alone(i), 0, ends + 1
+            assert np.allclose(obs[i], flights[i][j[i]], **close)
+    assert ends > n
+
+
+def test_features_ask_for_blocks_that_go_on_together(seen):
+    with pytest.raises(ValueError, match="decision_period"):
+        observed(seen, 2, decision_period=3)
+    with pytest.raises(ValueError, match="SameStep"):
+        observed(seen, 2, autoreset_mode=AutoresetMode.NEXT_STEP)
+    envs = observed(seen, 2)
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match="together"):
+        envs.reset(options={"reset_mask": np.array([True, False])})
 
 
 class Recorder(torch.nn.Module):

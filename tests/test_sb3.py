@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecMonito
 
 from fdi_gym.envs import FDIEnv
 from fdi_gym.sb3 import FDIVecEnv, make_vec_env
-from fdi_gym.wrappers import BlockSummary, DelayAwareReward, VectorHistory
+from fdi_gym.wrappers import DelayAwareReward, VectorHistory
 
 N = 3
 SHORT = {"decision_period": 200, "units": "scaled"}
@@ -159,23 +159,6 @@ def test_delay_costs_until_the_label_is_right_and_a_relapse_costs_all():
     stays = labels[5::2, 3::4] == labels[4:-1:2, 3::4]  # the sample before was answered right
     assert (rewards[5::2, 3::4][stays] == -1).all()
     assert stays.mean() > 0.9
-
-
-@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda m: m.value)
-def test_summary_is_mean_and_newest_sample(mode):
-    arguments = {"num_envs": N, "decision_period": 400, "autoreset_mode": mode}
-    plain = gym.make_vec("B747Lateral-Faults-v0", **arguments)
-    shown = BlockSummary(gym.make_vec("B747Lateral-Faults-v0", **arguments))
-    (block, _), (found, _) = plain.reset(seed=1), shown.reset(seed=1)
-    for _ in range(3):
-        assert np.array_equal(found, np.stack([block.mean(axis=1), block[:, -1]], axis=1))
-        assert shown.observation_space.contains(found)
-        block, _, _, _, infos = plain.step(np.zeros(N, int))
-        found, _, _, _, infos_shown = shown.step(np.zeros(N, int))
-    if mode is AutoresetMode.SAME_STEP:
-        assert np.array_equal(infos_shown["final_obs"][0][1], infos["final_obs"][0][-1])
-    with pytest.raises(ValueError, match="decision_period"):
-        BlockSummary(gym.make_vec("B747Lateral-Faults-v0", num_envs=2))
 
 
 def test_weights_and_task_of_the_delay_aware_reward():

@@ -1,12 +1,13 @@
-"""Policies trained by PPO (stable-baselines3) on the environments: windows of raw samples in, a decision out.
+"""Policies trained by PPO (stable-baselines3) on the environments: features of an identified model in, a decision out.
 
-`ppo` isolates; `ppo_identification` estimates. How they were trained is in `baselines.networks.reinforcement`. The
-committed weights are the actor alone; stable-baselines3 is not needed to run them.
+`ppo` isolates; `ppo_identification` estimates. They see what `sequence_net` sees
+(`baselines.networks.identification`), and answer at the end of each step; the answer holds until the next. How they were
+trained is in `baselines.networks.reinforcement`. The committed weights are the actor and the model; neither torch nor
+stable-baselines3 is needed to run them.
 """
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,10 @@ from fdi_gym.plant import Plant
 from fdi_gym.training import trainer
 
 
-@diagnoser("ppo", "PPO on windows of observations, delay-aware reward", method="ppo")
-@diagnoser("ppo_identification", "PPO on windows of observations, for the fault parameters", method="ppo_identification")
+@diagnoser("ppo", "PPO on features of an identified model, delay-aware reward", method="ppo")
+@diagnoser(
+    "ppo_identification", "PPO on features of an identified model, for the fault parameters", method="ppo_identification"
+)
 def ppo(plant: Plant, *, method: str = "ppo", path: str = "") -> Diagnoser:
     """The trained policy.
 
@@ -27,11 +30,10 @@ def ppo(plant: Plant, *, method: str = "ppo", path: str = "") -> Diagnoser:
         path: Weights of your own; their card lies beside them.
 
     Raises:
-        NotApplicableError: No weights for this plant and its options, or no torch.
+        NotApplicableError: No weights for this plant and its options, or no safetensors.
+        RefusedError: Weights or a card that are not what they should be.
     """
-    weights, policy, adapters = (network_module(name) for name in ("weights", "policy", "adapters"))
-    import torch
-
+    weights, policy, ident = (network_module(name) for name in ("weights", "policy", "identification"))
     file = Path(path) if path else weights.WEIGHTS / f"{method}-{plant.id}.safetensors"
     if not file.exists():
         raise NotApplicableError(f"no trained weights for {plant.id}; train them: fdi-gym train {method} {plant.id}")
@@ -39,16 +41,12 @@ def ppo(plant: Plant, *, method: str = "ppo", path: str = "") -> Diagnoser:
         tensors, card = weights.read(file, plant)
     except weights.WrongPlantError as error:
         raise NotApplicableError(str(error)) from error
-    answers = len(plant.labels) if card.task == "isolation" else len(plant.estimated)
-    widths = [card.shape["length"] * 2 * len(plant.observed), card.shape["hidden"], card.shape["hidden"], answers]
-    expected: dict[str, tuple[int, ...]] = {}
-    for i, (a, b) in enumerate(itertools.pairwise(widths)):
-        expected |= {f"layers.{i}.weight": (b, a), f"layers.{i}.bias": (b,)}
-    weights.check_tensors(file, tensors, expected)
-    actor = policy.Policy(widths)
-    actor.load_state_dict({name: torch.from_numpy(value) for name, value in tensors.items()})
-    window = {name: card.shape[name] for name in ("decision_period", "length", "stride")}
-    return adapters.from_torch(actor, plant, task=card.task, dtype=torch.float64, **window)
+    if missing := {*ident.Shape._fields, "hidden"} - card.shape.keys():
+        raise weights.RefusedError(f"{file.with_suffix('.json')} does not give {', '.join(sorted(missing))} of the shape")
+    shape = ident.Shape(**{name: card.shape[name] for name in ident.Shape._fields})
+    weights.check_tensors(file, tensors, policy.shapes(plant, shape, card.task, card.shape["hidden"]))
+    model = ident.Model(*(tensors[f"model.{name}"] for name in ident.Model._fields))
+    return policy.streaming(plant, shape, model, tensors, card.task)
 
 
 @trainer("ppo", "PPO on the isolation task")

@@ -55,6 +55,18 @@ def fly(plant: Plant, source: Source, seeds: Sequence[int]) -> Record:
     return simulate(plant, [draw(process, seed) for seed in seeds])
 
 
+def identified(plants: Sequence[Plant], shape: Shape, records: Sequence[Record]) -> Model:
+    """The model of a plant, identified from recorded flights of each of its variants; their truth is used."""
+    z = [ident.blocks(plant, record.obs, shape.stride) for plant, record in zip(plants, records, strict=True)]
+    truth = [
+        at_steps(ident.deviation(plant, record.target), shape.stride)[:, : b.shape[1]]
+        for plant, record, b in zip(plants, records, z, strict=True)
+    ]
+    pairs = ((b[i : i + 50], d[i : i + 50]) for b, d in zip(z, truth, strict=True) for i in range(0, len(b), 50))
+    model = ident.identify(plants[0], shape, pairs)
+    return ident.standardised(plants[0], shape, model, np.concatenate([b[:40] for b in z]))
+
+
 def selected(plant: Plant, source: Source, candidates: Sequence[int], count: int) -> list[int]:
     """`count` of the candidate seeds, so that flights whose rarest label is any given one come as evenly as they can.
 

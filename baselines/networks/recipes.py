@@ -34,14 +34,11 @@ HEARD = {  # the filters that residual_net hears, and training flights per proce
 }
 GENERAL_HEARD = (("augmented_ekf", "multiple_model_ekf"), 300)
 
-STANDARD = Source("standard", {})
-POLICIES = {
-    "B747Lateral": reinforcement.Recipe(source=STANDARD, decision_period=5, length=32, decisions=300_000, updates=4),
-    "HUAVHover": reinforcement.Recipe(
-        source=Source("standard", {"kappa": 0.3}), decision_period=5, length=16, decisions=200_000, updates=4
-    ),
-    "MissilePitch": reinforcement.Recipe(source=STANDARD, decision_period=10, length=16, decisions=200_000, updates=4),
-    "CMGSatellite": reinforcement.Recipe(source=STANDARD, decision_period=50, length=16, decisions=200_000, updates=4),
+POLICIES = {  # steps: decisions of a flight, less one
+    "B747Lateral": {"steps": 299, "decisions": 600_000, "entropy": 0.003},
+    "HUAVHover": {"steps": 199, "decisions": 1_000_000},
+    "MissilePitch": {"steps": 199, "decisions": 800_000},
+    "CMGSatellite": {"steps": 249, "decisions": 600_000, "candidates": 4, "epochs": 6, "validate": 6},
 }
 
 
@@ -84,6 +81,13 @@ def train(
     return Run(method, plant_id, recipe, base=base, command=_command(method, plant_id, budget, seed), **where).run()
 
 
+def policy_recipe(plant_id: str) -> reinforcement.Recipe:
+    """How a plant's policy is trained: on the processes of its supervised network, seeing the same features."""
+    like = RECIPES.get(plant_id, GENERAL)
+    shared = {name: getattr(like, name) for name in ("sources", "shape", "identify", "candidates")}
+    return reinforcement.Recipe(**shared | POLICIES.get(plant_id, {}))
+
+
 def train_ppo(
     method: str, plant_id: str, *, budget: int | None = None, seed: int = 0, work: Path = Path("runs"), threads: int = 1
 ) -> Path:
@@ -100,9 +104,9 @@ def train_ppo(
     Raises:
         ValueError: The folder holds another run.
     """
-    recipe = POLICIES.get(plant_id, reinforcement.Recipe(source=STANDARD))
+    recipe = policy_recipe(plant_id)
     if method == "ppo_identification":
-        recipe = replace(recipe, task="identification", entropy=0.0)
+        recipe = replace(recipe, task="identification", entropy=0.0, decisions=recipe.decisions // 2)
     if budget is not None:
         recipe = replace(recipe, decisions=budget)
     where = {"seed": seed, "work": work / f"{method}-{plant_id}-{seed}", "threads": threads}

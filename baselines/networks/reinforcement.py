@@ -1,9 +1,11 @@
 """PPO (stable-baselines3) on the environments, through the bridge, in legs that can be resumed exactly.
 
-A diagnosis never feeds back into the plant, so a decision is worth its own reward: the discount is 0. The isolation
-reward is `fdi_gym.wrappers.DelayAwareReward`, weighted so that every label counts the same; the identification reward is
-the environment's. A leg begins new flights, from seeds and random streams of its own, so a checkpoint at its end needs
-weights and the optimiser's moments only.
+The policy sees what the supervised network sees: the features of a model of the plant, identified from training flights
+(`baselines.networks.identification`); their recursive estimates are its memory. A diagnosis never feeds back into the
+plant, so a decision is worth its own reward: the discount is 0. The isolation reward is
+`fdi_gym.wrappers.DelayAwareReward`, weighted so that every label counts the same; the identification reward is the
+environment's. The fault processes take turns, a leg each. A leg begins new flights, from seeds and random streams of its
+own, so a checkpoint at its end needs the weights, the optimiser's moments, the model and the labels' shares only.
 """
 
 from __future__ import annotations
@@ -21,33 +23,24 @@ from gymnasium.vector import AutoresetMode
 from safetensors import safe_open
 from safetensors.numpy import save
 from stable_baselines3 import PPO
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.vec_env import VecMonitor
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from baselines.networks import flights as data
 from baselines.networks import weights
-from baselines.networks.adapters import from_torch
 from baselines.networks.flights import PER_SEED, TRAINING, VALIDATION, Source
-from baselines.networks.policy import Policy, actor_tensors, compressed
+from baselines.networks.identification import Model, Shape
+from baselines.networks.observed import IdentifiedFeatures
+from baselines.networks.policy import actor_tensors, streaming
 from fdi_gym.diagnosis import run
 from fdi_gym.evaluation import write_whole
 from fdi_gym.metrics import balanced_accuracy, scored_samples
 from fdi_gym.plant import Array
 from fdi_gym.sb3 import FDIVecEnv
-from fdi_gym.wrappers import BlockSummary, DelayAwareReward, VectorHistory
+from fdi_gym.simulation import Record
+from fdi_gym.wrappers import DelayAwareReward
 
-
-class Compressed(BaseFeaturesExtractor):
-    """`compressed` as SB3 wants it."""
-
-    def __init__(self, observation_space):
-        super().__init__(observation_space, int(np.prod(observation_space.shape)))
-
-    def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """Features of observations."""
-        return compressed(observations)
+HEAVIEST = 10.0  # weight of a rare label's reward
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,14 +48,15 @@ class Recipe:
     """How a policy is trained.
 
     Args:
-        source: Fault process and options of the plant.
+        sources: Fault processes, with the options of the plant; they take turns.
+        shape: Of the identified model; the policy decides once per `shape.period` samples.
+        identify: Training flights per process from which the model is identified, with their truth: the first ones.
         task: "isolation" or "identification".
-        decision_period: Samples per decision.
-        length, stride: Of the window, in decisions.
         patience: Of the delay-aware reward, in decisions.
         decisions: The budget.
-        envs: Environments side by side.
-        steps: Decisions of each per update.
+        candidates: Seeds per training flight, from which those are taken that show rare labels.
+        envs: Environments side by side. Their flights begin together, so `steps` should span whole flights ...
+        steps: Decisions of each per update; ... but not their very end, where new flights would begin for nothing.
         updates: Updates per leg.
         epochs: Passes over an update's decisions.
         batch: Decisions per gradient step.
@@ -70,25 +64,25 @@ class Recipe:
         hidden: Widths of the two layers.
         entropy: Weight of the entropy.
         validate: Legs between validations.
-        validation: Flights of the validation.
+        validation: Flights per process of the validation.
     """
 
-    source: Source
+    sources: tuple[Source, ...]
+    shape: Shape
+    identify: int = 300
     task: str = "isolation"
-    decision_period: int = 10
-    length: int = 16
-    stride: int = 1
     patience: float = 10.0
     decisions: int = 1_000_000
+    candidates: int = 1
     envs: int = 64
-    steps: int = 64
-    updates: int = 8
+    steps: int = 250
+    updates: int = 1
     epochs: int = 4
     batch: int = 512
     rate: float = 1e-3
     hidden: int = 128
-    entropy: float = 0.003
-    validate: int = 4
+    entropy: float = 0.01
+    validate: int = 8
     validation: int = 60
 
 
@@ -114,32 +108,64 @@ class Run:
         torch.set_num_threads(threads)
         self.method, self.plant_id, self.recipe, self.seed, self.command = method, plant_id, recipe, seed, command
         self.work, self.checkpoint = work, work / "checkpoint.safetensors"
-        self.plant = data.plant_of(plant_id, recipe.source)
+        self.plants = [data.plant_of(plant_id, source) for source in recipe.sources]
+        self.plant = self.plants[0]
         self.first = TRAINING + PER_SEED * seed
         per_leg = recipe.envs * recipe.steps * recipe.updates
         self.legs, self.per_leg = max(1, round(recipe.decisions / per_leg)), per_leg
         self.leg, self.seconds, self.curve = 0, 0.0, []
+        self.started = time.perf_counter()
+        self.held_out: list[Record] = []
         work.mkdir(parents=True, exist_ok=True)
-        self.model = self.make()
         if self.checkpoint.exists():
             self.restore()
+        else:
+            self.begin()
 
-    def make(self) -> PPO:
-        """Environments and a new policy."""
+    def begin(self) -> None:
+        """Identify the plant, and make a new policy."""
+        seeds = range(self.first, self.first + self.recipe.identify)
+        records = [data.fly(p, s, seeds) for p, s in zip(self.plants, self.recipe.sources, strict=True)]
+        share = np.stack([self.share_of(index) for index in range(len(self.plants))])
+        self.make(data.identified(self.plants, self.recipe.shape, records), share)
+
+    def share_of(self, index: int) -> Array:
+        """Share of each label in the first training flights of a process, as they are planned."""
+        plant, source = self.plants[index], self.recipe.sources[index]
+        seeds = [seed for leg in range(4) for seed in self.seeds_of(leg, index)]
+        rows = [plant.label_rows(data.draw(plant.process(source.process), seed)) for seed in seeds]
+        return np.bincount(np.concatenate(rows), minlength=len(plant.labels)) / sum(map(len, rows))
+
+    def seeds_of(self, leg: int, index: int) -> list[int]:
+        """The seeds of the flights that a leg begins with."""
         r = self.recipe
-        arguments: dict[str, Any] = {"task": r.task, "scenario": r.source.process, "decision_period": r.decision_period}
-        arguments |= {"units": "scaled", "autoreset_mode": AutoresetMode.SAME_STEP, **r.source.options}
-        envs: Any = gym.make_vec(self.plant.env_id, num_envs=r.envs, **arguments)
-        if r.task == "isolation":
-            labels = data.fly(self.plant, r.source, range(self.first, self.first + 200)).label
-            share = np.bincount(labels.ravel(), minlength=len(self.plant.labels)) / labels.size
-            envs = DelayAwareReward(envs, r.patience, np.minimum(1 / (len(share) * np.maximum(share, 1e-9)), 10.0).tolist())
-        venv = VecMonitor(FDIVecEnv(VectorHistory(BlockSummary(envs), r.length, r.stride)))
-        return PPO(
-            "MlpPolicy", venv, learning_rate=r.rate, n_steps=r.steps, batch_size=r.batch, n_epochs=r.epochs, gamma=0.0,
-            gae_lambda=0.0, ent_coef=r.entropy, seed=self.seed, device="auto" if torch.cuda.is_available() else "cpu",
-            policy_kwargs={"features_extractor_class": Compressed, "net_arch": [r.hidden, r.hidden], "log_std_init": -1.0},
+        first = self.first + r.identify + leg * r.envs * r.candidates
+        return data.selected(self.plants[index], r.sources[index], range(first, first + r.envs * r.candidates), r.envs)
+
+    def make(self, model: Model, share: Array) -> None:
+        """Environments and a new policy, from the model and each process's share (processes, labels) of each label."""
+        r = self.recipe
+        self.model, self.share = model, share
+        self.venvs = [self.environments(index) for index in range(len(r.sources))]
+        self.agent = PPO(
+            "MlpPolicy", self.venvs[0], learning_rate=r.rate, n_steps=r.steps, batch_size=r.batch, n_epochs=r.epochs,
+            gamma=0.0, gae_lambda=0.0, ent_coef=r.entropy, seed=self.seed,
+            device="auto" if torch.cuda.is_available() else "cpu",
+            policy_kwargs={"net_arch": [r.hidden, r.hidden], "log_std_init": -1.0},
         )  # fmt: skip
+
+    def environments(self, index: int) -> FDIVecEnv:
+        """The environments of one process, as the policy sees and is rewarded by them."""
+        r, plant = self.recipe, self.plants[index]
+        source = r.sources[index]
+        arguments: dict[str, Any] = {"task": r.task, "scenario": source.process, "decision_period": r.shape.period}
+        arguments |= {"autoreset_mode": AutoresetMode.SAME_STEP, **source.options}
+        arguments["units"] = "physical" if r.task == "isolation" else "scaled"  # an action in [-1, 1] is learned best
+        envs: Any = gym.make_vec(plant.env_id, num_envs=r.envs, **arguments)
+        if r.task == "isolation":
+            weight = 1 / (len(plant.labels) * np.maximum(self.share[index], 1e-9))
+            envs = DelayAwareReward(envs, r.patience, np.minimum(weight, HEAVIEST).tolist())
+        return FDIVecEnv(IdentifiedFeatures(envs, plant, r.shape, self.model))
 
     def identity(self) -> str:
         """What a checkpoint must share with the run that goes on from it."""
@@ -147,8 +173,9 @@ class Run:
 
     def save(self) -> None:
         """Write the checkpoint whole."""
-        tensors = {f"policy.{k}": v.cpu().numpy() for k, v in self.model.policy.state_dict().items()}
-        for i, moments in self.model.policy.optimizer.state_dict()["state"].items():
+        tensors = {f"policy.{k}": v.cpu().numpy() for k, v in self.agent.policy.state_dict().items()}
+        tensors |= {"share": self.share, **{f"model.{k}": a for k, a in self.model._asdict().items()}}
+        for i, moments in self.agent.policy.optimizer.state_dict()["state"].items():
             tensors |= {f"adam.{i}.{k}": v.cpu().numpy() for k, v in moments.items()}
         state = {"leg": self.leg, "seconds": self.seconds, "curve": self.curve, "run": self.identity()}
         write_whole(self.checkpoint, save(tensors, metadata={"state": json.dumps(state)}))
@@ -161,7 +188,8 @@ class Run:
         if state["run"] != self.identity():
             raise ValueError(f"{self.checkpoint} is of a run with another recipe or seed; move it away to begin a new one")
         self.leg, self.seconds, self.curve = state["leg"], state["seconds"], state["curve"]
-        policy = self.model.policy
+        self.make(Model(*(tensors[f"model.{name}"] for name in Model._fields)), tensors["share"])
+        policy = self.agent.policy
         policy.load_state_dict({k: torch.from_numpy(tensors[f"policy.{k}"]) for k in policy.state_dict()})
         adam = policy.optimizer.state_dict()
         moments = ("step", "exp_avg", "exp_avg_sq")
@@ -172,44 +200,42 @@ class Run:
 
     def one_leg(self) -> float:
         """Fly and learn; the mean reward per decision."""
-        r, model = self.recipe, self.model
-        model.set_random_seed(int(np.random.SeedSequence([self.seed, self.leg]).generate_state(1)[0]))
-        model.get_env().seed(self.first + 1000 + self.leg * r.envs)  # type: ignore[union-attr]
-        model.learning_rate = r.rate * (1 - 0.9 * self.leg / self.legs)
-        model._setup_lr_schedule()
-        model._last_obs = None  # the leg begins with a reset
-        model.learn(self.per_leg, reset_num_timesteps=False)
+        r, agent = self.recipe, self.agent
+        agent.set_random_seed(int(np.random.SeedSequence([self.seed, self.leg]).generate_state(1)[0]))
+        index = self.leg % len(self.venvs)
+        self.venvs[index]._seeds = list(self.seeds_of(self.leg, index))
+        agent.set_env(self.venvs[index])  # the leg begins with a reset
+        agent.learning_rate = r.rate * (1 - 0.9 * self.leg / self.legs)
+        agent._setup_lr_schedule()
+        agent.learn(self.per_leg, reset_num_timesteps=False)
         self.leg += 1
-        return float(model.rollout_buffer.rewards.mean())
+        return float(agent.rollout_buffer.rewards.mean())
 
-    def actor(self) -> tuple[Policy, dict[str, Array]]:
-        """The actor alone, and its tensors."""
-        tensors = actor_tensors(self.model.policy.state_dict())
-        shapes = [a.shape for name, a in tensors.items() if name.endswith("weight")]
-        policy = Policy([shapes[0][1], *(shape[0] for shape in shapes)])
-        policy.load_state_dict({k: torch.from_numpy(a.copy()) for k, a in tensors.items()})
-        return policy, tensors
+    def tensors(self) -> dict[str, Array]:
+        """What is stored: the actor and the model."""
+        model = {f"model.{name}": a for name, a in self.model._asdict().items()}
+        return model | actor_tensors(self.agent.policy.state_dict())
 
     def validate(self) -> dict[str, float]:
-        """Balanced accuracy per sample, or the scaled root mean square error, on the validation flights."""
-        r, plant = self.recipe, self.plant
-        record = data.fly(plant, r.source, range(VALIDATION, VALIDATION + r.validation))
-        said = run(
-            from_torch(
-                self.actor()[0], plant, task=r.task, decision_period=r.decision_period, length=r.length, stride=r.stride
-            ),
-            record.obs,
-        )
-        scoring, labels = plant.process(r.source.process).scoring, len(plant.labels)
-        confusion, squares = np.zeros((labels, labels + 1)), []
-        for i, (true, length) in enumerate(zip(record.label, record.length, strict=True)):
-            scored = scored_samples(true, int(length), scoring)
-            np.add.at(confusion, (true[scored], said.mode[i, scored].astype(int)), 1)
-            if said.theta is not None:
-                squares.append(((said.theta[i] - record.target[i]) / [s.scale for s in plant.estimated])[scored] ** 2)
-        if r.task == "identification":
-            return {"rmse": float(np.sqrt(np.concatenate(squares).mean()))}
-        return {r.source.process: float(balanced_accuracy(confusion))}
+        """Per process the balanced accuracy per sample, or the scaled root mean square error, on the validation flights."""
+        r, found = self.recipe, {}
+        if not self.held_out:
+            seeds = range(VALIDATION, VALIDATION + r.validation)
+            self.held_out = [data.fly(p, s, seeds) for p, s in zip(self.plants, r.sources, strict=True)]
+        for plant, source, record in zip(self.plants, r.sources, self.held_out, strict=True):
+            said = run(streaming(plant, r.shape, self.model, self.tensors(), r.task), record.obs)
+            scoring, labels = plant.process(source.process).scoring, len(plant.labels)
+            confusion, squares = np.zeros((labels, labels + 1)), []
+            for i, (true, length) in enumerate(zip(record.label, record.length, strict=True)):
+                scored = scored_samples(true, int(length), scoring)
+                np.add.at(confusion, (true[scored], said.mode[i, scored].astype(int)), 1)
+                if said.theta is not None:
+                    squares.append(((said.theta[i] - record.target[i]) / [s.scale for s in plant.estimated])[scored] ** 2)
+            if squares:
+                found[f"{source.process} rmse"] = float(np.sqrt(np.concatenate(squares).mean()))
+            else:
+                found[source.process] = float(balanced_accuracy(confusion))
+        return found
 
     def run(self, stop_after: int | None = None) -> Path:
         """Train, validate now and then, keep a checkpoint, and write weights and card at the end.
@@ -219,7 +245,7 @@ class Run:
         """
         r = self.recipe
         writer = SummaryWriter(str(self.work / "tensorboard"))
-        before = time.perf_counter() - self.seconds
+        before = self.started - self.seconds
         bar = tqdm(total=self.legs, initial=self.leg, desc=f"{self.method} {self.plant_id}", unit="leg")
         while self.leg < self.legs and (stop_after is None or self.leg < stop_after):
             reward = self.one_leg()
@@ -243,17 +269,17 @@ class Run:
         """Write the actor and its card."""
         r = self.recipe
         revision, versions = weights.made_with()
-        _, tensors = self.actor()
-        last = self.first + 1000 + self.legs * r.envs - 1
-        shape = {"decision_period": r.decision_period, "length": r.length, "stride": r.stride, "hidden": r.hidden}
+        last = self.first + r.identify + self.legs * r.envs * r.candidates - 1
         card = weights.Card(
-            method=self.method, env=self.plant.env_id, plant=self.plant_id, options=[dict(self.plant.options)],
-            processes=[r.source.process], **weights.names(self.plant), task=r.task, shape=shape,  # type: ignore[arg-type]
+            method=self.method, env=self.plant.env_id, plant=self.plant_id,
+            options=[dict(plant.options) for plant in self.plants], processes=[s.process for s in r.sources],
+            **weights.names(self.plant),  # type: ignore[arg-type]
+            task=r.task, shape={**r.shape._asdict(), "hidden": r.hidden},
             seeds={"training": [self.first, last], "validation": [VALIDATION, VALIDATION + r.validation - 1]},
-            budget={"decisions": self.legs * self.per_leg, "samples": self.legs * self.per_leg * r.decision_period,
+            budget={"decisions": self.legs * self.per_leg, "samples": self.legs * self.per_leg * r.shape.period,
                     "seconds": round(self.seconds, 1)},
             curve=self.curve, command=self.command, revision=revision, versions=versions,
         )  # fmt: skip
         path = self.work / f"{self.method}-{self.plant_id}.safetensors"
-        weights.write(path, tensors, card)
+        weights.write(path, self.tensors(), card)
         return path

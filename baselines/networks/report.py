@@ -103,12 +103,13 @@ def cost_table(cards: list[Card]) -> str:
             continue
         reached = max(entry["accuracy"]["standard"] for entry in card.curve)
         first = next(e for e in card.curve if e["accuracy"]["standard"] == reached)
+        samples = first["step"] * card.budget["samples"] / card.budget["decisions"]
         other = supervised[card.plant]
         per_flight = other.budget["samples"] / other.budget["flights"]
         same = next((e for e in other.curve if e["accuracy"]["standard"] >= reached), None)
         seen = "-" if same is None else f"{len(other.processes) * same['flights'] * per_flight / 1e6:.1f} M"
         lines.append([
-            card.plant, f"{100 * reached:.1f}", f"{first['step'] * card.shape['decision_period'] / 1e6:.1f} M",
+            card.plant, f"{100 * reached:.1f}", f"{samples / 1e6:.1f} M",
             f"{first['seconds'] / 60:.1f}", f"at most {seen}", "-" if same is None else f"{same['seconds'] / 60:.1f}",
             f"{100 * max(e['accuracy']['standard'] for e in other.curve):.1f}", f"{other.budget['seconds'] / 60:.1f}",
         ])  # fmt: skip

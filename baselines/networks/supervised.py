@@ -20,7 +20,7 @@ from safetensors.numpy import save
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from baselines.networks import calibration, identification, weights
+from baselines.networks import calibration, weights
 from baselines.networks import flights as data
 from baselines.networks.flights import CALIBRATION, PER_SEED, TRAINING, VALIDATION, Flights, Source
 from baselines.networks.identification import Model, Shape
@@ -149,15 +149,7 @@ class Run:
             self.make(model)
             self.start_from(tensors)
         else:
-            stride = recipe.shape.stride
-            z = [identification.blocks(self.plant, r.obs, stride) for r in records]
-            truth = [
-                data.at_steps(identification.deviation(p, r.target), stride)[:, : b.shape[1]]
-                for p, r, b in zip(self.plants, records, z, strict=True)
-            ]
-            pairs = ((b[i : i + 50], d[i : i + 50]) for b, d in zip(z, truth, strict=True) for i in range(0, len(b), 50))
-            model = identification.identify(self.plant, recipe.shape, pairs)
-            model = identification.standardised(self.plant, recipe.shape, model, np.concatenate([b[:40] for b in z]))
+            model = data.identified(self.plants, recipe.shape, records)
             self.make(model)
         share = np.stack([self.share_of(i) for i in range(len(recipe.sources))]) if recipe.candidates > 1 else prior
         self.progress = Progress(model, np.maximum(prior, 1e-4), share)
