@@ -44,7 +44,7 @@ POLICIES = {  # steps: decisions of a flight, less one
 
 def general(plant_id: str) -> Recipe:
     """A recipe for any plant: for its standard and hard processes, or whichever it has beside the healthy one."""
-    processes = data.plant_of(plant_id, STANDARD).processes
+    processes = data.plant_of(plant_id, Source("standard", {})).processes
     found = [name for name in ("standard", "hard") if name in processes] or [n for n in processes if n != "fault-free"]
     return Recipe(sources=tuple(Source(name, {}) for name in found), shape=Shape(stride=5, lags=6, degree=2))
 
@@ -83,7 +83,7 @@ def train(
 
 def policy_recipe(plant_id: str) -> reinforcement.Recipe:
     """How a plant's policy is trained: on the processes of its supervised network, seeing the same features."""
-    like = RECIPES.get(plant_id, GENERAL)
+    like = RECIPES.get(plant_id) or general(plant_id)
     shared = {name: getattr(like, name) for name in ("sources", "shape", "identify", "candidates")}
     return reinforcement.Recipe(**shared | POLICIES.get(plant_id, {}))
 

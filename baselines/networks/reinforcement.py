@@ -23,6 +23,7 @@ from gymnasium.vector import AutoresetMode
 from safetensors import safe_open
 from safetensors.numpy import save
 from stable_baselines3 import PPO
+from stable_baselines3.common.logger import Logger
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
@@ -153,6 +154,7 @@ class Run:
             device="auto" if torch.cuda.is_available() else "cpu",
             policy_kwargs={"net_arch": [r.hidden, r.hidden], "log_std_init": -1.0},
         )  # fmt: skip
+        self.agent.set_logger(Logger(folder=None, output_formats=[]))  # or SB3 leaves a temporary folder per leg
 
     def environments(self, index: int) -> FDIVecEnv:
         """The environments of one process, as the policy sees and is rewarded by them."""
