@@ -91,7 +91,8 @@ def test_streamed_diagnoses_are_those_of_the_whole_sequence(path):
     heard = flights.words(card.plant, source, card.filters, obs, shape.period)
     x = torch.from_numpy(np.concatenate([*seen, *heard], axis=2)).double()
     widths = tuple(word.shape[2] for word in heard)
-    net = SequenceNetwork(x.shape[2], len(plant.labels), len(plant.estimated), card.shape["hidden"], widths).double()
+    size = (x.shape[2], len(plant.labels), len(plant.estimated), card.shape["hidden"], widths, len(card.processes))
+    net = SequenceNetwork(*size).double()
     net.load_state_dict({name: torch.from_numpy(tensors[f"network.{name}"]) for name in net.state_dict()})
     with torch.inference_mode():
         logits, mean, log_std, _ = (a.numpy() for a in net(x))
@@ -129,13 +130,18 @@ def test_loss_falls_on_a_fixed_batch():
 
 def test_an_untrained_network_believes_the_filters_it_hears():
     torch.manual_seed(0)
-    net = SequenceNetwork(10 + 4 + 6, 3, 2, 16, words=(4, 6))
+    net = SequenceNetwork(8 + 2 + 4 + 6, 3, 2, 16, words=(4, 6), processes=2)
     x = torch.zeros(2, 5, 20)
+    x[0, :, 8] = x[1, :, 9] = 1.0  # the first expects one process, the second the other
     plain = net(x)[0]
     x[0, :, 10 + 1] = x[0, :, 14 + 1] = x[1, :, 10 + 2] = 1.0  # both filters say 1; the first says 2, the other nothing
     net.value.weight.data[:, 10:] = net.gate.weight.data[:, 10:] = net.join.weight.data[:, 10:20] = 0.0
     gain = net(x)[0] - plain
     assert torch.allclose(gain[0], torch.tensor([0.0, 3.0, 0.0]), atol=1e-5)
+    assert torch.allclose(gain[1], torch.tensor([0.0, 0.0, 1.5]), atol=1e-5)
+    net.direct.weight.data[:, :10] = 0.0  # trust of the first process
+    gain = net(x)[0] - plain
+    assert torch.allclose(gain[0], torch.zeros(3), atol=1e-5)
     assert torch.allclose(gain[1], torch.tensor([0.0, 0.0, 1.5]), atol=1e-5)
 
 

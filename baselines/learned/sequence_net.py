@@ -50,13 +50,15 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
     expected = process if process in card.processes else card.processes[0]
     shape = ident.Shape(**{name: card.shape[name] for name in ident.Shape._fields if name in card.shape})
     inputs = tensors["network.value.weight"].shape[1] if "network.value.weight" in tensors else 0
-    words = (tensors["network.direct.weight"].shape[1],) if "network.direct.weight" in tensors else ()
-    net = network.SequenceNetwork(inputs, len(plant.labels), len(plant.estimated), card.shape["hidden"], words).double()
+    processes, direct = len(card.processes), tensors.get("network.direct.weight", np.zeros((0, 0)))
+    words = (direct.shape[-1] // processes,) if direct.size else ()
+    size = (inputs, len(plant.labels), len(plant.estimated), card.shape["hidden"], words, processes)
+    net = network.SequenceNetwork(*size).double()
     sizes = {f"network.{name}": tuple(value.shape) for name, value in net.state_dict().items()}
     weights.check_tensors(file, tensors, sizes | ident.shapes(plant, shape))
     net.load_state_dict({name: torch.from_numpy(tensors[f"network.{name}"]) for name in net.state_dict()})
     model = ident.Model(*(tensors[f"model.{name}"] for name in ident.Model._fields))
-    context = np.eye(len(card.processes))[card.processes.index(expected)]
+    context = np.eye(processes)[card.processes.index(expected)]
     fitted = card.calibration[expected]
     scale, bias, prior = fitted["scale"], np.array(fitted["bias"]), np.array(fitted["prior"])
     healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)

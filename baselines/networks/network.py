@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 TRUST = 3.0  # in the filters' labels before training: a logit
+REACH = 10.0  # trust is learned so many times faster than the other weights: it must rise and fall by several logits
 
 
 class SequenceNetwork(nn.Module):
@@ -21,10 +22,13 @@ class SequenceNetwork(nn.Module):
         estimated: Entries of the identification task.
         hidden: Width of every layer.
         words: Entries of what each filter says, at the end of an input. They reach the logits directly, too: an untrained
-            network believes the labels that the filters declare, and training corrects that.
+            network believes the labels that the filters declare, and training corrects that, for each process apart.
+        processes: Entries before these words that say which fault process to expect: 1 for one, 0 for the others.
     """
 
-    def __init__(self, features: int, labels: int, estimated: int, hidden: int, words: tuple[int, ...] = ()):
+    def __init__(
+        self, features: int, labels: int, estimated: int, hidden: int, words: tuple[int, ...] = (), processes: int = 1
+    ):  # fmt: skip
         super().__init__()
         self.labels, self.estimated, self.hidden = labels, estimated, hidden
         self.value, self.gate = nn.Linear(features, hidden), nn.Linear(features, hidden)
@@ -32,11 +36,11 @@ class SequenceNetwork(nn.Module):
         self.memory = nn.GRU(hidden, hidden, batch_first=True)
         self.read = nn.Linear(hidden, hidden)
         self.heads = nn.Linear(hidden, labels + 2 * estimated)
-        self.words = sum(words)
+        self.words, self.processes = sum(words), processes
         if words:
-            self.direct = nn.Linear(self.words, labels, bias=False)
-            believe = [torch.eye(labels, width) * TRUST / len(words) for width in words]
-            self.direct.weight.data = torch.cat(believe, dim=1)
+            self.direct = nn.Linear(processes * self.words, labels, bias=False)
+            believe = [torch.eye(labels, width) * TRUST / REACH / len(words) for width in words]
+            self.direct.weight.data = torch.cat(believe * processes, dim=1)
 
     def forward(self, x: Tensor, h: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Features (N, T, n) after the memory h (1, N, hidden): logits, mean, log std (N, T, ...), and the memory."""
@@ -46,7 +50,8 @@ class SequenceNetwork(nn.Module):
         out = self.heads(F.silu(self.read(seen + remembered)))
         logits, mean, log_std = out.split([self.labels, self.estimated, self.estimated], dim=-1)
         if self.words:
-            logits = logits + self.direct(x[..., -self.words :])
+            process, words = x[..., -self.words - self.processes : -self.words], x[..., -self.words :]
+            logits = logits + REACH * self.direct((process[..., None] * words[..., None, :]).flatten(-2))
         return logits, mean, log_std.clamp(-6.0, 3.0), after
 
 

@@ -28,9 +28,9 @@ RECIPES = {
 }  # fmt: skip
 HEARD = {  # the filters that residual_net hears, and training flights per process: filters cost more than networks
     "B747Lateral": (("bayes_bank", "switching_bayes_bank"), 600),
-    "HUAVHover": (("hypothesis_bank", "ascdkf"), 600),
+    "HUAVHover": (("hypothesis_bank", "ascdkf"), 1000),
     "MissilePitch": (("augmented_ekf_imm", "augmented_ekf_mode_probabilities"), 600),
-    "CMGSatellite": (("mekf",), 300),
+    "CMGSatellite": (("mekf",), 400),
 }
 GENERAL_HEARD = (("augmented_ekf", "multiple_model_ekf"), 300)
 

@@ -132,7 +132,8 @@ class Run:
         heard = data.words(self.plant_id, recipe.sources[0], recipe.filters, obs, recipe.shape.period)
         words = tuple(word.shape[-1] for word in heard)
         width = len(model.mean) + len(recipe.sources) + sum(words)
-        self.network = SequenceNetwork(width, len(p.labels), len(p.estimated), recipe.hidden, words).to(self.device)
+        shape = (width, len(p.labels), len(p.estimated), recipe.hidden, words, len(recipe.sources))
+        self.network = SequenceNetwork(*shape).to(self.device)
         self.optimiser = torch.optim.AdamW(self.network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
 
     def begin(self) -> None:
