@@ -106,7 +106,7 @@ def train_ppo(
     """
     recipe = policy_recipe(plant_id)
     if method == "ppo_identification":
-        recipe = replace(recipe, task="identification", entropy=0.0, decisions=recipe.decisions // 2)
+        recipe = replace(recipe, task="identification", entropy=0.0, decisions=2_000_000)
     if budget is not None:
         recipe = replace(recipe, decisions=budget)
     where = {"seed": seed, "work": work / f"{method}-{plant_id}-{seed}", "threads": threads}
