@@ -16,10 +16,9 @@ import numpy as np
 import scipy.linalg
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-from baselines.filters.three_stage_cdkf import X0_STD
 from fdi_gym.diagnosis import find_diagnoser
 from fdi_gym.plant import load_plant
-from fdi_gym.plants.huav_hover import DT, dynamics, episode
+from fdi_gym.plants.huav_hover import DT, X0_STD, dynamics, episode
 from fdi_gym.simulation import simulate
 
 NAMES = ("ascdkf", "three_stage_cdkf", "three_stage_ekf", "robust_three_stage_cdkf", "robust_three_stage_ekf",
@@ -72,7 +71,7 @@ def measure(batch=64, steps=50, rounds=5):
     y, u, _ = plant.split(obs)
     states, best = {}, {}
     built = {name: find_diagnoser(name) for name in NAMES}
-    built = {name: entry.build(plant, **entry.settings) for name, entry in built.items()}
+    built = {name: entry.build(plant, **entry.settings_on(plant)) for name, entry in built.items()}
     for name, diagnoser in built.items():
         states[name] = diagnoser.init(batch)
         for k in range(5):

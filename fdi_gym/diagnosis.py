@@ -63,6 +63,10 @@ class Entry(NamedTuple):
     settings: Mapping[str, Any]
     clairvoyant: bool
 
+    def settings_on(self, plant: Plant, **tuning: Any) -> dict[str, Any]:
+        """What its builder gets: the caller's tuning over the name's settings over what the plant brings."""
+        return {**plant.tuning.get(self.name, {}), **self.settings, **tuning}
+
 
 _entries: dict[str, Entry] = {}
 
@@ -136,20 +140,21 @@ def make_diagnoser(name: str, plant: Plant, *, scenarios: Sequence[Any] | None =
         name: As in `find_diagnoser`.
         plant: The plant whose model it gets.
         scenarios: The truth, one per episode; only a clairvoyant one gets it.
-        tuning: Keyword arguments of its builder, over those of the name.
+        tuning: Keyword arguments of its builder, over those of the name, which are over those of the plant.
 
     Raises:
         ValueError: Unknown name or keyword; `NotApplicableError` where the method cannot run on this plant.
     """
     entry = find_diagnoser(name)
     allowed = inspect.signature(entry.build).parameters
-    for key in tuning:
+    settings = entry.settings_on(plant, **tuning)
+    for key in settings:
         if key not in allowed:
             raise ValueError(f"{name} has no setting {key!r}; it has {', '.join(list(allowed)[1:]) or 'none'}")
     known = {"scenarios": scenarios} if entry.clairvoyant else {}
     if entry.clairvoyant and scenarios is None:
         raise ValueError(f"{name} knows the truth: it needs scenarios, one per episode")
-    return guarded(entry.build(plant, **{**entry.settings, **tuning, **known}), plant)
+    return guarded(entry.build(plant, **settings, **known), plant)
 
 
 def told(name: str, process: str) -> dict[str, str]:

@@ -59,7 +59,7 @@ def test_diagnoser(short_calibrations, plant_id, name):
 
     def make(plant, scenarios):
         known = {"scenarios": scenarios} if entry.clairvoyant else {}
-        return entry.build(plant, **entry.settings, **known)
+        return entry.build(plant, **entry.settings_on(plant), **known)
 
     try:
         make(build(plant_id), [draw(build(plant_id).processes["standard"], 0)])

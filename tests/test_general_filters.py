@@ -1,5 +1,6 @@
 """The filters that need nothing but a plant's declaration: model, prior, filters, alarms, calibration."""
 
+import dataclasses
 import inspect
 import itertools
 import json
@@ -10,7 +11,7 @@ from conftest import PLANTS, build
 from scipy.optimize import lsq_linear
 from scipy.stats import betabinom
 
-from baselines.filters import ascdkf, augmented_kf, three_stage_cdkf, two_stage_kf
+from baselines.filters import ascdkf, augmented_kf, two_stage_kf
 from fdi_gym.diagnosis import NotApplicableError, diagnosers, make_diagnoser, run
 from fdi_gym.estimation import calibration, unknown_inputs
 from fdi_gym.estimation import prior as prior_file
@@ -35,6 +36,7 @@ from fdi_gym.estimation.linear import linear_model
 from fdi_gym.estimation.prior import VALIDATION_SEED, flights_of, long_run, prior
 from fdi_gym.faults import draw
 from fdi_gym.plants import b747_lateral as b747_file
+from fdi_gym.plants import huav_hover
 from fdi_gym.simulation import simulate
 
 ALL_PLANTS = [*PLANTS, "DCMotor"]
@@ -116,12 +118,12 @@ def test_general_filter_is_the_augmented_kf_with_its_tuning(b747, rule):
 
 def test_general_central_difference_filter_is_the_ascdkf_with_its_tuning():
     plant = build("HUAVHover")
-    model = augmented(plant, x0_std=three_stage_cdkf.X0_STD, z0_std=[2e-3] * 4, z_walk=[7e-4] * 4)
+    model = augmented(plant, x0_std=huav_hover.X0_STD, z0_std=[2e-3] * 4, z_walk=[7e-4] * 4)
     P0, Q = model.P0.copy(), model.Q.copy()
     P0[15:, 15:], Q[:11, :11], Q[15:, 15:] = 0.5**2 * np.eye(2), plant.Q, 0.05**2 * np.eye(2)
     model = model._replace(P0=P0, Q=Q, R=plant.R, limit=np.full(17, np.inf))
     obs = flown(plant)[1].obs[:, :120]
-    diagnoser = ascdkf.ascdkf(plant)
+    diagnoser = ascdkf.ascdkf(plant, **plant.tuning["ascdkf"])
     state = diagnoser.init(2)
     for k, s in enumerate(followed(model, "central difference", obs, False)):
         state, _ = diagnoser.update(state, obs[:, k])
@@ -512,7 +514,7 @@ def test_builds_or_says_why_not(monkeypatch, plant_id, name):
     known = {"scenarios": [draw(plant.process("standard"), 0)]} if entry.clairvoyant else {}
     reason = ""
     try:
-        entry.build(plant, **entry.settings, **known)
+        entry.build(plant, **entry.settings_on(plant), **known)
     except NotApplicableError as error:
         reason = str(error) or "none given"
     assert not reason or (len(reason) > 20 and name in FAMILY), reason
@@ -558,3 +560,17 @@ def test_flags_are_calibrated_where_the_table_has_no_thresholds(short_calibratio
     assert np.shape(thresholds) == (4,)
     assert min(thresholds) > 0
     assert not said.alarm[:, :10].any()
+
+
+def test_a_plant_brings_tuning_which_a_caller_overrides():
+    plant, entry = build("HUAVHover"), diagnosers()["ascdkf"]
+    assert entry.settings_on(plant) == {"x0_std": huav_hover.X0_STD, **huav_hover.WALKS}
+    assert entry.settings_on(plant, b_step=1.0)["b_step"] == 1.0
+    assert diagnosers()["augmented_ekf_cusum"].settings_on(plant)["decision"] == "cusum"
+    obs = flown(plant)[1].obs[:, :40]
+    theirs = run(make_diagnoser("ascdkf", plant), obs).theta
+    plain = dataclasses.replace(plant, tuning={})
+    assert np.array_equal(theirs, run(make_diagnoser("ascdkf", plain, **plant.tuning["ascdkf"]), obs).theta)
+    assert not np.allclose(theirs, run(make_diagnoser("ascdkf", plant, b_step=1e-2), obs).theta)
+    with pytest.raises(ValueError, match="null has no setting 'gain'"):
+        make_diagnoser("null", dataclasses.replace(plant, tuning={"null": {"gain": 1}}))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from baselines.filters import three_stage_cdkf
 from baselines.filters.flag_thresholds import TABLE, calibrate
 from baselines.filters.hypothesis_bank import transitions
 from baselines.filters.matched_oracle import steady_filter
@@ -27,7 +26,8 @@ from fdi_gym.plants import b747_lateral, huav_hover
 from fdi_gym.simulation import no_noise, simulate
 from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env
 
-PAPER, X0_STD = three_stage_cdkf.PAPER[huav_hover.ID], three_stage_cdkf.X0_STD
+X0_STD = huav_hover.X0_STD
+PAPER = {"x0_std": X0_STD, **huav_hover.WALKS}
 P3, P4 = ("lon", "lat", "ped"), huav_hover.CHANNELS
 FILTERS = ("ascdkf", "three_stage_cdkf", "three_stage_ekf", "robust_three_stage_cdkf", "robust_three_stage_ekf")
 ALL = (*FILTERS, "hypothesis_bank", "matched_oracle")
@@ -41,7 +41,7 @@ def plant():
 
 def build(name, plant, **tuning):
     entry = find_diagnoser(name)
-    return entry.build(plant, **{**entry.settings, **tuning})
+    return entry.build(plant, **entry.settings_on(plant, **tuning))
 
 
 def last_state(diagnoser, obs):

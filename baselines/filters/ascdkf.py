@@ -13,7 +13,6 @@ import numpy as np
 import scipy.linalg
 
 from baselines.filters.flag_thresholds import thresholds_for
-from baselines.filters.three_stage_cdkf import PAPER
 from fdi_gym.diagnosis import Diagnoser, diagnoser
 from fdi_gym.estimation.kalman import T, right_divide, symmetric, times
 from fdi_gym.estimation.propagation import central_difference_moments, central_difference_points
@@ -55,8 +54,8 @@ def ascdkf(
         alpha: Smoothing of the flag logic.
         thresholds: Of the flag logic, one per channel. Default: the calibrated table, else calibrated when first used.
         decision: "flags" or "distance". Default: flags where they can tell the plant's labels apart.
-        process: The fault process that will be met. Tuning that is None is the paper's on the helicopter, elsewhere what
-            this process says.
+        process: The fault process that will be met. Tuning that is None is what this process
+            says; the helicopter brings its paper's (`Plant.tuning`).
         h: Interval of the central differences, in standard deviations.
 
     Raises:
@@ -64,7 +63,7 @@ def ascdkf(
         ValueError: Unknown decision or process, or a list of the wrong length.
     """
     given = {"x0_std": x0_std, "b0_std": b0_std, "d0_std": d0_std, "b_step": b_step, "d_step": d_step}
-    known = known_of(plant, channels, process, given, PAPER.get(plant.id, {}))
+    known = known_of(plant, channels, process, given)
     inputs, sensors, H, _, _, Q, R, *_ = known
     n_x, p, q = len(plant.states), len(inputs.names), len(plant.disturbances)
     N = n_x + p + q

@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from baselines.filters.three_stage_cdkf import X0_STD
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, NotApplicableError, diagnoser
 from fdi_gym.estimation.flags import label_sets
 from fdi_gym.estimation.kalman import T, right_divide, symmetric, times
 from fdi_gym.estimation.propagation import fault_inputs, linear_output
 from fdi_gym.estimation.unknown_inputs import initial_covariance
 from fdi_gym.plant import Array, Plant
+from fdi_gym.plants.huav_hover import X0_STD
 
 
 class Bank(NamedTuple):

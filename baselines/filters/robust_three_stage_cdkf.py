@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from baselines.filters.flag_thresholds import thresholds_for
-from baselines.filters.three_stage_cdkf import PAPER, RULES
+from baselines.filters.three_stage_cdkf import RULES
 from fdi_gym.diagnosis import Diagnoser, diagnoser
 from fdi_gym.estimation.propagation import Rule
 from fdi_gym.estimation.robust_three_stage import RobustThreeStage, check_existence, start, step
@@ -42,8 +42,8 @@ def robust_three_stage_cdkf(
         alpha: Smoothing of the flag logic.
         thresholds: Of the flag logic, one per channel. Default: the calibrated table, else calibrated when first used.
         decision: "flags" or "distance". Default: flags where they can tell the plant's labels apart.
-        process: The fault process that will be met. x0_std None is the paper's on the helicopter, elsewhere what this
-            process says.
+        process: The fault process that will be met. x0_std None is what this process says; the helicopter
+            brings its paper's (`Plant.tuning`).
         rule: Propagation, "central difference" or "extended".
 
     Raises:
@@ -53,7 +53,7 @@ def robust_three_stage_cdkf(
     """
     if rule not in RULES:
         raise ValueError(f"unknown rule {rule!r}; there are {', '.join(RULES)}")
-    known = known_of(plant, channels, process, {"x0_std": x0_std}, PAPER.get(plant.id, {}), ["x0_std"])
+    known = known_of(plant, channels, process, {"x0_std": x0_std}, ["x0_std"])
     inputs, sensors, H, x0, P0, Q, R, *_ = known
     check_existence(plant, inputs, H, R)
     p, q = len(inputs.names), len(plant.disturbances)

@@ -9,7 +9,6 @@ Z. Nejati et al., Int. J. Engineering, Transactions B 34(5), 2021, Table 1.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from baselines.filters.flag_thresholds import thresholds_for
 from fdi_gym.diagnosis import Diagnoser, NotApplicableError, diagnoser
@@ -19,12 +18,6 @@ from fdi_gym.estimation.unknown_inputs import judged, known_of
 from fdi_gym.plant import Array, Plant
 
 RULES = {"central difference": central_difference_rule, "extended": extended_rule}
-# Standard deviations of the initial state of the hovering helicopter: velocities, rates and attitude, flapping
-X0_STD = (0.1, 0.1, 0.1, 0.02, 0.02, 0.02, 0.02, 0.02, 0.02, 0.005, 0.005)
-# The tuning of the paper's plant: fault [rad], gust [m/s]
-PAPER: dict[str, dict[str, Any]] = {
-    "HUAVHover": {"x0_std": X0_STD, "b0_std": 2e-3, "d0_std": 0.5, "b_step": 7e-4, "d_step": 0.05}
-}
 
 
 @diagnoser("three_stage_cdkf", "Three-stage central-difference Kalman filter (ThSCDKF)")
@@ -54,8 +47,8 @@ def three_stage_cdkf(
         alpha: Smoothing of the flag logic.
         thresholds: Of the flag logic, one per channel. Default: the calibrated table, else calibrated when first used.
         decision: "flags" or "distance". Default: flags where they can tell the plant's labels apart.
-        process: The fault process that will be met. Tuning that is None is the paper's on the helicopter, elsewhere what
-            this process says.
+        process: The fault process that will be met. Tuning that is None is what this process
+            says; the helicopter brings its paper's (`Plant.tuning`).
         rule: Propagation, "central difference" or "extended".
 
     Raises:
@@ -67,7 +60,7 @@ def three_stage_cdkf(
     if not plant.disturbances:
         raise NotApplicableError(f"no unknown input: {plant.id} has no disturbance for the third stage")
     given = {"x0_std": x0_std, "b0_std": b0_std, "d0_std": d0_std, "b_step": b_step, "d_step": d_step}
-    known = known_of(plant, channels, process, given, PAPER.get(plant.id, {}))
+    known = known_of(plant, channels, process, given)
     inputs, sensors, H, x0, P0, Q, R, P0b, Qb, P0d, Qd = known
     propagate: Rule = RULES[rule](plant, inputs)
     name = "three_stage_cdkf" if rule == "central difference" else "three_stage_ekf"

@@ -48,7 +48,7 @@ NUMBERS = {"bias": "bias", "stuck_at": "stuck at", "stuck_hold": "stuck in place
 def build(name: str, plant: Plant, **tuning: Any) -> Diagnoser:
     """The diagnoser itself: the measurement reads its state."""
     entry = find_diagnoser(name)
-    return entry.build(plant, **{**entry.settings, **tuning})
+    return entry.build(plant, **entry.settings_on(plant, **tuning))
 
 
 @dataclasses.dataclass

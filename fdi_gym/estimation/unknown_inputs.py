@@ -58,17 +58,15 @@ def known_of(
     channels: Sequence[str] | None,
     process: str,
     given: Mapping[str, Any],
-    paper: Mapping[str, Any],
     used: Sequence[str] = TUNING,
 ) -> Known:
-    """What a filter knows of the plant: what is given, else the paper's, else what the fault process says.
+    """What a filter knows of the plant: what is given, else what the fault process says.
 
     Args:
         plant: A plant with sensors y = H x and additive faults.
         channels: The fault channels. Default: all.
         process: The fault process that will be met.
         given: Standard deviations by their name in TUNING, one or one per entry; None where not given.
-        paper: The paper's, where this is its plant.
         used: Those that the filter uses.
 
     Raises:
@@ -84,7 +82,7 @@ def known_of(
     if plant.measured_disturbance is not None:
         raise NotApplicableError(f"has no place for a disturbance that is known; that of {plant.id} is measured")
     p, q = len(inputs.names), len(plant.disturbances)
-    std = {name: given.get(name) if given.get(name) is not None else paper.get(name) for name in used}
+    std = {name: given.get(name) for name in used}
     Q, R, P0 = plant.Q, plant.R[np.ix_(sensors, sensors)], None
     if any(value is None for value in std.values()):
         found = prior(plant, process)
