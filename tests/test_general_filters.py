@@ -41,7 +41,9 @@ from fdi_gym.simulation import simulate
 
 ALL_PLANTS = [*PLANTS, "DCMotor"]
 SMALL = 5e-3
-GENERAL = [name for name, entry in diagnosers().items() if "process" in inspect.signature(entry.build).parameters]
+LEARNED = ("sequence_net", "residual_net")
+TOLD = [name for name, entry in diagnosers().items() if "process" in inspect.signature(entry.build).parameters]
+GENERAL = [name for name in TOLD if name not in LEARNED]
 FAMILY = ("ascdkf", "three_stage_cdkf", "three_stage_ekf", "robust_three_stage_cdkf", "robust_three_stage_ekf")
 
 

@@ -171,6 +171,8 @@ def test_a_network_is_told_the_process_and_takes_an_unknown_one_for_the_first(ti
     )
     assert np.array_equal(first.mode_probs, same.mode_probs)
     assert not np.allclose(first.mode_probs, other.mode_probs)
+    with pytest.raises(ValueError, match="unknown scenario"):
+        make_diagnoser("sequence_net", plant, path=str(tiny), process="no such")
 
 
 @pytest.mark.parametrize("stop", [1, 3])

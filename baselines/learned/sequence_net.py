@@ -33,6 +33,7 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
         path: Weights of your own; their card lies beside them.
 
     Raises:
+        ValueError: The plant has no such process.
         NotApplicableError: No weights for this plant and its options, or no torch.
     """
     weights, network, ident, flights, calibration = (
@@ -40,6 +41,7 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
     )
     import torch
 
+    plant.process(process)
     file = Path(path) if path else weights.WEIGHTS / f"{method}-{plant.id}.safetensors"
     if not file.exists():
         raise NotApplicableError(f"no trained weights for {plant.id}; train them: fdi-gym train {method} {plant.id}")
