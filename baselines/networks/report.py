@@ -75,7 +75,7 @@ def accuracy_table() -> str:
         "suite",
         "learned",
         "per sample %",
-        "best paper filter",
+        "best filter",
         "against it",
         "best reference bank",
         "against it",
@@ -149,7 +149,7 @@ def budget_table(cards: list[Card]) -> str:
 
 
 def picture(card: Card, path: Path) -> None:
-    """The learning curve: validated score over training time, with the score of the best paper filter on the suite."""
+    """The learning curve: validated score over training time."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6, 3.4), layout="constrained")
@@ -157,8 +157,10 @@ def picture(card: Card, path: Path) -> None:
     minutes = [entry["seconds"] / 60 for entry in card.curve]
     for name in card.curve[0]["accuracy"]:
         values: list[Any] = [entry["accuracy"][name] for entry in card.curve]
-        axes.plot(minutes, values if name == "rmse" else [100 * v for v in values], label=name, marker=".", markersize=3)
-    score = "scaled RMSE" if "rmse" in card.curve[0]["accuracy"] else "balanced accuracy %"
+        axes.plot(
+            minutes, values if name.endswith("rmse") else [100 * v for v in values], label=name, marker=".", markersize=3
+        )
+    score = "balanced accuracy %" if card.task != "identification" else "scaled RMSE"
     axes.set(xlabel="minutes of training, one core of a shared machine", ylabel=f"{score}, validation flights")
     axes.set_title(f"{card.method}, {card.plant}", fontsize=10)
     axes.legend(frameon=False)
