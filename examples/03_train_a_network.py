@@ -27,7 +27,7 @@ if __name__ == "__main__":
     card = weights.read_card(path)
     for entry in card.curve:
         print(f"step {entry['step']:4d}, {entry['seconds']:5.1f} s: balanced accuracy {entry['accuracy']['standard']:.3f}")
-    before, after = card.calibration["standard"]["log_score"]
+    before, after = card.calibration["standard"].log_score
     print(f"log score on validation flights: {before:.3f}, calibrated {after:.3f}")
     plant = load_plant("B747Lateral")
     seen = simulate(plant, [draw(plant.process("standard"), seed) for seed in range(20)])

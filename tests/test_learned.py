@@ -98,7 +98,7 @@ def test_streamed_diagnoses_are_those_of_the_whole_sequence(path):
         logits, mean, log_std, _ = (a.numpy() for a in net(x))
     said = run(make_diagnoser(path.stem.split("-")[0], plant), obs)
     fitted = card.calibration[card.processes[0]]
-    probs = np.exp(calibration.log_softmax(fitted["scale"] * logits + np.array(fitted["bias"])))
+    probs = np.exp(calibration.log_softmax(fitted.scale * logits + np.array(fitted.bias)))
     at = slice(shape.period - 1, None, shape.period)
     unit = np.array([s.scale for s in plant.estimated])
     assert np.allclose(said.mode_probs[:, at], probs, atol=1e-5)
@@ -305,6 +305,16 @@ def test_pickles_zips_and_other_files_are_refused(tiny, tmp_path):
 def test_a_card_that_does_not_fit_is_refused(tiny, tmp_path):
     with pytest.raises(weights.RefusedError, match="digest differs"):
         load(altered(tiny, tmp_path, edit={"sha256": "0" * 64}))
+    shape = weights.read_card(tiny).shape
+    for edit, reason in [
+        ({"shape": {**shape, "hidden": "16"}}, "hidden is a whole number above 0, not '16'"),
+        ({"shape": {k: v for k, v in shape.items() if k != "lags"}}, "lags is a whole number above 0, not None"),
+        ({"calibration": {}}, "no calibration of 5 labels for 'standard'"),
+        ({"filters": ["os:system"]}, "'os:system', which is no filter"),
+        ({"filters": ["known_onset_oracle"]}, "'known_onset_oracle', which is no filter"),
+    ]:
+        with pytest.raises(weights.RefusedError, match=reason):
+            load(altered(tiny, tmp_path, edit=edit))
     with pytest.raises(NotApplicableError, match="B747Lateral-Faults-v9"):
         load(altered(tiny, tmp_path, edit={"env": "B747Lateral-Faults-v9"}))
     with pytest.raises(weights.RefusedError, match="not a card"):

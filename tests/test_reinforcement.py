@@ -76,7 +76,7 @@ def test_tensors_or_a_card_of_another_shape_are_refused(tiny, tmp_path):
     for name, other in (("model.V", None), ("model.W", tensors["model.W"][:, 1:]), ("layers.2.bias", np.zeros(6, "f4"))):
         refused(name, {**tensors, name: other})
     refused(
-        "every, lags of the shape",
+        "the shape's lags is a whole number",
         card=msgspec.structs.replace(card, shape={"stride": 50, "degree": 1, "effects": 1, "hidden": 8}),
     )
 

@@ -41,10 +41,8 @@ def ppo(plant: Plant, *, method: str = "ppo", path: str = "") -> Diagnoser:
         tensors, card = weights.read(file, plant)
     except weights.WrongPlantError as error:
         raise NotApplicableError(str(error)) from error
-    if missing := {*ident.Shape._fields, "hidden"} - card.shape.keys():
-        raise weights.RefusedError(f"{file.with_suffix('.json')} does not give {', '.join(sorted(missing))} of the shape")
-    shape = ident.Shape(**{name: card.shape[name] for name in ident.Shape._fields})
-    weights.check_tensors(file, tensors, policy.shapes(plant, shape, card.task, card.shape["hidden"]))
+    shape, hidden = weights.shape_of(file, card)
+    weights.check_tensors(file, tensors, policy.shapes(plant, shape, card.task, hidden))
     model = ident.Model(*(tensors[f"model.{name}"] for name in ident.Model._fields))
     return policy.streaming(plant, shape, model, tensors, card.task)
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from baselines.learned import network_module
-from fdi_gym.diagnosis import Diagnoser, Diagnosis, NotApplicableError, diagnoser, make_diagnoser, told
+from fdi_gym.diagnosis import Diagnoser, Diagnosis, NotApplicableError, diagnoser, diagnosers, make_diagnoser, told
 from fdi_gym.plant import Array, Plant
 from fdi_gym.training import trainer
 
@@ -35,6 +35,7 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
     Raises:
         ValueError: The plant has no such process.
         NotApplicableError: No weights for this plant and its options, or no torch.
+        RefusedError: Weights or a card that are not what they should be.
     """
     weights, network, ident, flights, calibration = (
         network_module(name) for name in ("weights", "network", "identification", "flights", "calibration")
@@ -50,19 +51,22 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
     except weights.WrongPlantError as error:
         raise NotApplicableError(str(error)) from error
     expected = process if process in card.processes else card.processes[0]
-    shape = ident.Shape(**{name: card.shape[name] for name in ident.Shape._fields if name in card.shape})
+    shape, hidden = weights.shape_of(file, card)
+    for name in card.filters:  # never "module:function", which would be imported
+        if name not in diagnosers() or diagnosers()[name].clairvoyant:
+            raise weights.RefusedError(f"{file.with_suffix('.json')} names {name!r}, which is no filter that can be heard")
     inputs = tensors["network.value.weight"].shape[1] if "network.value.weight" in tensors else 0
     processes, direct = len(card.processes), tensors.get("network.direct.weight", np.zeros((0, 0)))
     words = (direct.shape[-1] // processes,) if direct.size else ()
-    size = (inputs, len(plant.labels), len(plant.estimated), card.shape["hidden"], words, processes)
+    size = (inputs, len(plant.labels), len(plant.estimated), hidden, words, processes)
     net = network.SequenceNetwork(*size).double()
     sizes = {f"network.{name}": tuple(value.shape) for name, value in net.state_dict().items()}
     weights.check_tensors(file, tensors, sizes | ident.shapes(plant, shape))
     net.load_state_dict({name: torch.from_numpy(tensors[f"network.{name}"]) for name in net.state_dict()})
     model = ident.Model(*(tensors[f"model.{name}"] for name in ident.Model._fields))
     context = np.eye(processes)[card.processes.index(expected)]
-    fitted = card.calibration[expected]
-    scale, bias, prior = fitted["scale"], np.array(fitted["bias"]), np.array(fitted["prior"])
+    fitted = weights.fitted_of(file, card, expected)
+    scale, bias, prior = fitted.scale, np.array(fitted.bias), np.array(fitted.prior)
     healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
     unit = np.array([s.scale for s in plant.estimated])
     heard = [make_diagnoser(name, plant, **told(name, expected)) for name in card.filters]
@@ -70,7 +74,7 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
     def init(n: int) -> Any:
         said = Diagnosis(np.zeros(n, bool), np.zeros(n, np.int64), np.tile(healthy, (n, 1)), np.tile(unit, (n, 1)),
                          np.tile(prior / prior.sum(), (n, 1)))  # fmt: skip
-        return 0, ident.begin(plant, shape, n), np.zeros((n, card.shape["hidden"])), [f.init(n) for f in heard], said
+        return 0, ident.begin(plant, shape, n), np.zeros((n, hidden)), [f.init(n) for f in heard], said
 
     def answer(features: Array, h: Array) -> tuple[Array, Diagnosis]:
         with torch.inference_mode():

@@ -89,7 +89,7 @@ def calibration_table(cards: list[Card]) -> str:
     lines = []
     for card in cards:
         for process, found in card.calibration.items():
-            (l0, l1), (e0, e1) = found["log_score"], found["calibration_error"]
+            (l0, l1), (e0, e1) = found.log_score, found.calibration_error
             lines.append([card.plant, card.method, process, f"{l0:.3f}", f"{l1:.3f}", f"{e0:.4f}", f"{e1:.4f}"])
     return markdown(["plant", "network", "process", "log score before", "after", "calibration error before", "after"], lines)
 

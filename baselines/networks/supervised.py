@@ -320,7 +320,7 @@ class Run:
 
     # -- the end
 
-    def calibrate(self, validation: Flights) -> dict[str, Any]:
+    def calibrate(self, validation: Flights) -> dict[str, weights.Fitted]:
         """Fit the calibration on its own flights and measure it on the validation flights."""
         p, r = self.progress, self.recipe
         flown, _ = self.held_out(CALIBRATION)
@@ -333,11 +333,13 @@ class Run:
             label = validation.label[theirs]
             plain = calibration.log_softmax(measured[theirs] + np.log(p.prior[index]))
             better = calibration.log_softmax(scale * measured[theirs] + bias)
-            found[source.process] = {
-                "scale": scale, "bias": bias.tolist(), "prior": p.prior[index].tolist(),
-                "log_score": [calibration.log_score(a, label) for a in (plain, better)],
-                "calibration_error": [calibration.calibration_error(a, label) for a in (plain, better)],
-            }  # fmt: skip
+            found[source.process] = weights.Fitted(
+                scale=scale, bias=bias.tolist(), prior=p.prior[index].tolist(),
+                log_score=(calibration.log_score(plain, label), calibration.log_score(better, label)),
+                calibration_error=(
+                    calibration.calibration_error(plain, label), calibration.calibration_error(better, label)
+                ),
+            )  # fmt: skip
         return found
 
     def finish(self, validation: Flights) -> Path:

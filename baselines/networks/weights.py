@@ -17,6 +17,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from baselines.networks.identification import Shape
 from fdi_gym.evaluation import write_whole
 from fdi_gym.plant import Array, Plant
 
@@ -29,6 +30,22 @@ class RefusedError(ValueError):
 
 class WrongPlantError(RefusedError):
     """Weights that are in order, but of another plant or other options."""
+
+
+class Fitted(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A calibration for one process.
+
+    Args:
+        scale, bias: Of the logits; one bias per label.
+        prior: Share of each label in training flights.
+        log_score, calibration_error: On the validation flights, with the prior alone and calibrated.
+    """
+
+    scale: float
+    bias: list[float]
+    prior: list[float]
+    log_score: tuple[float, float]
+    calibration_error: tuple[float, float]
 
 
 class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -47,7 +64,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         seeds: First and last seed of the training, validation and calibration flights.
         budget: What was used: flights, samples, steps, seconds.
         curve: The training curve: one entry per validation.
-        calibration: Per process what was fitted on the calibration flights, and what it did on the validation flights.
+        calibration: Per process what was fitted on the calibration flights.
         command: What to type to train them again.
         revision: Git revision of the code, or "".
         versions: Of the libraries.
@@ -69,7 +86,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     seeds: dict[str, list[int]]
     budget: dict[str, float]
     curve: list[dict[str, Any]]
-    calibration: dict[str, Any] = {}
+    calibration: dict[str, Fitted] = {}
     command: str
     revision: str
     versions: dict[str, str]
@@ -154,6 +171,34 @@ def read(path: Path, plant: Plant) -> tuple[dict[str, Array], Card]:
     if dict(plant.options) not in card.options:
         raise WrongPlantError(f"{path.name} was trained with the options {card.options}, not {dict(plant.options)}")
     return tensors, card
+
+
+def shape_of(path: Path, card: Card) -> tuple[Shape, int]:
+    """The shape of the identified model and the width of the layers, as the card gives them.
+
+    Raises:
+        RefusedError: One is missing, or not a whole number above 0.
+    """
+    sizes: dict[str, int] = {}
+    for name in (*Shape._fields, "hidden"):
+        value = card.shape.get(name, Shape._field_defaults.get(name))
+        if not isinstance(value, int) or value < 1:
+            raise RefusedError(f"{path.with_suffix('.json')}: the shape's {name} is a whole number above 0, not {value!r}")
+        sizes[name] = value
+    hidden = sizes.pop("hidden")
+    return Shape(**sizes), hidden
+
+
+def fitted_of(path: Path, card: Card, process: str) -> Fitted:
+    """The calibration for a process.
+
+    Raises:
+        RefusedError: There is none, or not one entry per label.
+    """
+    found = card.calibration.get(process)
+    if found is None or not len(found.bias) == len(found.prior) == len(card.labels) or not sum(found.prior) > 0:
+        raise RefusedError(f"{path.with_suffix('.json')} has no calibration of {len(card.labels)} labels for {process!r}")
+    return found
 
 
 def check_tensors(path: Path, tensors: dict[str, Array], expected: dict[str, tuple[int, ...]]) -> None:
