@@ -19,7 +19,6 @@ from fdi_gym.estimation.kalman import T, right_divide, symmetric, times
 from fdi_gym.estimation.propagation import fault_inputs, linear_output
 from fdi_gym.estimation.unknown_inputs import initial_covariance
 from fdi_gym.plant import Array, Plant
-from fdi_gym.plants.huav_hover import X0_STD
 
 
 class Bank(NamedTuple):
@@ -48,7 +47,7 @@ def hypothesis_bank(
     plant: Plant,
     *,
     channels: Sequence[str] | None = None,
-    x0_std: Sequence[float] = X0_STD,
+    x0_std: Sequence[float] | None = None,
     d0_std: float = 0.5,
     b_onset: Sequence[float] = (5e-3, 2e-3, 2e-3, 6e-3),
     b_step: Sequence[float] = (0.7e-3, 0.5e-3, 0.5e-3, 0.7e-3),
@@ -65,7 +64,7 @@ def hypothesis_bank(
     Args:
         plant: A plant whose fault enters additively and whose sensors are linear.
         channels: The fault channels. Default: all.
-        x0_std: Standard deviations of the initial state.
+        x0_std: Standard deviations of the initial state; the helicopter brings its own (`Plant.tuning`).
         d0_std: Of the initial disturbance.
         b_onset: Standard deviation of a fault at its onset, per entry of `plant.estimated` [rad].
         b_step: Of its random walk per step.
@@ -80,6 +79,8 @@ def hypothesis_bank(
         NotApplicableError: The plant is not of that kind, or the settings have not one entry per fault.
     """
     inputs, H = fault_inputs(plant, channels), linear_output(plant)
+    if x0_std is None:
+        raise NotApplicableError(f"needs x0_std, the spread of the initial state, which {plant.id} does not bring")
     for name, value in (("b_onset", b_onset), ("b_step", b_step)):
         if len(value) != len(plant.estimated):
             raise NotApplicableError(f"{name} needs one entry per fault of {plant.id}: {len(plant.estimated)}")

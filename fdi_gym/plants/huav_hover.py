@@ -531,7 +531,8 @@ def plant(*, kappa: float = 0.3, K_B: float = 0.84) -> Plant:
         q=np.concatenate([K.ravel(), u_trim, x_trim, [p[5], np.exp(-DT / TAU_F)]]),
         tuning={
             **{name: {"x0_std": X0_STD, **WALKS} for name in ("three_stage_cdkf", "three_stage_ekf", "ascdkf")},
-            **{name: {"x0_std": X0_STD} for name in ("robust_three_stage_cdkf", "robust_three_stage_ekf")},
+            **{name: {"x0_std": X0_STD}
+               for name in ("robust_three_stage_cdkf", "robust_three_stage_ekf", "hypothesis_bank")},
         },
         physical=physical, perturb=perturb,
         noise=prescribed_noise, isolation_reward=np.eye(len(labels)) - 0.5 * wrongly,
