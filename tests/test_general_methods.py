@@ -265,6 +265,10 @@ def test_consistency_of_the_kalman_filter(b747):
     found = measure(b747, "standard", "augmented_ekf")
     assert abs(found["NIS"]["mean"] - 1) < 0.05
     assert found["NEES"]["mean"] < 1.05  # conservative: it allows for faults that never come
+    residual = measure(b747, "standard", "ascdkf")  # from residuals after the update, not from innovations
+    same = measure(b747, "standard", "augmented_cdkf")
+    assert residual["NIS"]["mean"] == pytest.approx(same["NIS"]["mean"], abs=5e-3)
+    assert residual["NEES"]["mean"] == pytest.approx(same["NEES"]["mean"], abs=5e-3)
     assert verdict(1.0, 0.95) == "consistent"
     assert verdict(1.2, 0.5) == "optimistic"
     assert verdict(0.8, 0.5) == "conservative"

@@ -1,4 +1,4 @@
-"""Are the general filters as sure of themselves as they may be? NIS and NEES on healthy flights.
+"""Are the Gaussian filters as sure of themselves as they may be? NIS and NEES on healthy flights.
 
 At every sample the normalised innovation squared and the normalised estimation error squared are averaged over the
 flights; if the filter's covariances are right, the averages are chi-square with (flights x dimension) degrees of freedom
@@ -17,10 +17,13 @@ import numpy as np
 from scipy.stats import chi2
 
 from baselines.filters.adaptive_ukf import Adaptive, adaptive_filter
+from fdi_gym.diagnosis import find_diagnoser
 from fdi_gym.estimation import gaussian, two_stage
 from fdi_gym.estimation.augmented import Augmented, augmented
-from fdi_gym.estimation.kalman import quadratic
+from fdi_gym.estimation.kalman import quadratic, times
 from fdi_gym.estimation.prior import flights_of
+from fdi_gym.estimation.three_stage import ThreeStage
+from fdi_gym.estimation.unknown_inputs import known_of
 from fdi_gym.plant import Array, Plant
 
 FIRST, FLIGHTS, SAMPLES = 300_000, 40, 2000  # seeds after VALIDATION_SEED, flights, samples of each that are used
@@ -68,6 +71,26 @@ def adaptive(plant: Plant, process: str, grid: str) -> Sure:
     return Sure(filter.start, filter.step, believes)
 
 
+def unknown_input_filter(plant: Plant, process: str, name: str) -> Sure:
+    """A filter of states, faults and disturbances with linear sensors y = H x.
+
+    It keeps no innovation. With the optimal gain the residual after the update is y - H x = R S^-1 nu, and its covariance
+    R S^-1 R = R - H P H', so that its normalised square is that of the innovation.
+    """
+    entry, n_x = find_diagnoser(name), len(plant.states)
+    inputs, sensors, H, _, _, _, R, *_ = known_of(plant, None, process, plant.tuning.get(name, {}))
+    settings = entry.settings_on(plant, process=process, decision="flags", thresholds=[1.0] * len(inputs.names))
+    raw = entry.build(plant, **settings)
+
+    def believes(s: tuple[Any, Array]) -> tuple[Array, Array, Array, Array]:
+        own, obs = s[0][1], s[1]
+        x = own.estimates()[0] if isinstance(own, ThreeStage) else own.x[:, :n_x]
+        P = (own.covariance() if isinstance(own, ThreeStage) else own.P)[:, :n_x, :n_x]
+        return x, P, plant.split(obs)[0].take(sensors, axis=1) - times(H, x), R - H @ P @ H.T
+
+    return Sure(lambda n: (raw.init(n), np.zeros(0)), lambda s, obs: (raw.update(s[0], obs)[0], obs), believes)
+
+
 FILTERS: dict[str, Callable[[Plant, str], Sure]] = {
     "augmented_ekf": lambda plant, process: gaussian_filter(plant, process, "extended"),
     "augmented_ukf": lambda plant, process: gaussian_filter(plant, process, "unscented"),
@@ -76,6 +99,9 @@ FILTERS: dict[str, Callable[[Plant, str], Sure]] = {
     "adaptive_ukf_full": lambda plant, process: adaptive(plant, process, "full"),
     "adaptive_ukf_simplified": lambda plant, process: adaptive(plant, process, "simplified"),
     "adaptive_ukf_elements": lambda plant, process: adaptive(plant, process, "elements"),
+    "ascdkf": lambda plant, process: unknown_input_filter(plant, process, "ascdkf"),
+    "three_stage_cdkf": lambda plant, process: unknown_input_filter(plant, process, "three_stage_cdkf"),
+    "three_stage_ekf": lambda plant, process: unknown_input_filter(plant, process, "three_stage_ekf"),
 }
 
 

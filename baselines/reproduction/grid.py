@@ -75,7 +75,8 @@ def run(arguments: Arguments) -> dict[str, Any]:
             command = f"fdi-gym evaluate {suite.name} --diagnosers {name}"
             rows, timing = evaluate(suite, [name], work=arguments.work, jobs=arguments.jobs, command=command)
             write_rows(arguments.results, suite, rows, timing)
-    jobs: dict[str, Any] = {f"{s.name}.{name}": (consistency_piece, (s, name)) for s in suites for name in FILTERS}
+    jobs: dict[str, Any] = {f"{s.name}.{name}": (consistency_piece, (s, name))
+                            for s in suites for name in FILTERS if name not in reasons[s.name]}  # fmt: skip
     return {"consistency": pieces(arguments.work / "consistency", jobs, arguments.jobs), "reasons": reasons}
 
 
