@@ -16,12 +16,13 @@ file's kernels may call. A kernel must not call a kernel of another file, which 
 the generic kernels below get the addresses of the plant's compiled functions (`address`) and call through them. So
 they are compiled once for all plants, nothing is compiled to bring the two together, and a call costs a microsecond.
 
-The cache lies in the user's cache folder (or `FDI_GYM_CACHE_DIR`) under a hash of the package's sources and of the
-file that defines the kernel, so that no edit is ever answered by old code.
+The cache lies in the user's cache folder (or `FDI_GYM_CACHE_DIR`) under a hash of the file that defines the kernel and
+of the files of the package that it imports, so that no edit is ever answered by old code.
 """
 
 from __future__ import annotations
 
+import ast
 import functools
 import hashlib
 import inspect
@@ -56,13 +57,26 @@ _ROLES = {
 
 
 @functools.cache
-def _package_hash() -> str:
-    """Hash of every source file of the package: a changed helper anywhere means a new cache folder."""
-    digest = hashlib.sha256()
-    root = Path(__file__).parent
-    for path in sorted(root.rglob("*.py")):
-        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:16]
+def sources(path: Path) -> tuple[Path, ...]:
+    """A source file and those of the package that it imports, directly or not: what its kernels can depend on."""
+    found, todo = set(), [path.resolve()]
+    root = Path(__file__).resolve().parent
+    while todo:
+        here = todo.pop()
+        if here in found:
+            continue
+        found.add(here)
+        for node in ast.walk(ast.parse(here.read_bytes())):
+            names = []
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            elif isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            for name in names:
+                package, *rest = name.split(".")
+                if package == root.name and (file := root.joinpath(*rest).with_suffix(".py")).is_file():
+                    todo.append(file)
+    return tuple(sorted(found))
 
 
 _signatures: dict[Any, Any] = {}  # of the kernels, compiled when they are first needed
@@ -74,9 +88,11 @@ def cache_folder(source: str) -> Path | None:
     """The cache folder that belongs to these sources; None where there can be none."""
     if not Path(source).is_file():
         return None
-    own = hashlib.sha256(Path(source).read_bytes()).hexdigest()[:16]
+    digest = hashlib.sha256()
+    for path in sources(Path(source)):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
     base = Path(os.environ.get("FDI_GYM_CACHE_DIR") or platformdirs.user_cache_path("fdi_gym"))
-    folder = base / f"{_package_hash()}-{own}"
+    folder = base / f"{Path(source).stem}-{digest.hexdigest()[:16]}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:

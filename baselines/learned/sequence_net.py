@@ -52,8 +52,9 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
         raise NotApplicableError(str(error)) from error
     expected = process if process in card.processes else card.processes[0]
     shape, hidden = weights.shape_of(file, card)
+    entries = diagnosers()
     for name in card.filters:  # never "module:function", which would be imported
-        if name not in diagnosers() or diagnosers()[name].clairvoyant:
+        if name not in entries or entries[name].clairvoyant:
             raise weights.RefusedError(f"{file.with_suffix('.json')} names {name!r}, which is no filter that can be heard")
     inputs = tensors["network.value.weight"].shape[1] if "network.value.weight" in tensors else 0
     processes, direct = len(card.processes), tensors.get("network.direct.weight", np.zeros((0, 0)))

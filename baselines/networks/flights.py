@@ -13,7 +13,7 @@ from baselines.networks import identification as ident
 from baselines.networks.identification import Model, Shape
 from fdi_gym.diagnosis import Diagnosis, make_diagnoser, run, told
 from fdi_gym.faults import draw
-from fdi_gym.metrics import scored_samples
+from fdi_gym.metrics import balanced_accuracy, scored_samples
 from fdi_gym.plant import Array, Plant, PlantSource, add_plant_source, load_plant, plant_sources
 from fdi_gym.simulation import Record, simulate
 
@@ -79,6 +79,26 @@ def selected(plant: Plant, source: Source, candidates: Sequence[int], count: int
     rarest = np.array([labels[np.argmin(often[labels])] for labels in shown])
     turn = np.array([np.count_nonzero(rarest[:i] == label) for i, label in enumerate(rarest)])  # of its group
     return [candidates[i] for i in sorted(np.lexsort((rarest, turn))[:count])]
+
+
+def label_share(plant: Plant, source: Source, seeds: Sequence[int]) -> Array:
+    """Share of each label in the flights of these seeds, as they are planned."""
+    rows = [plant.label_rows(draw(plant.process(source.process), seed)) for seed in seeds]
+    return np.bincount(np.concatenate(rows), minlength=len(plant.labels)) / sum(map(len, rows))
+
+
+def scored_of(plant: Plant, source: Source, record: Record) -> Array:
+    """Which samples of recorded flights are scored: (N, K + 1)."""
+    scoring = plant.process(source.process).scoring
+    return np.stack([scored_samples(true, int(n), scoring) for true, n in zip(record.label, record.length, strict=True)])
+
+
+def accuracy(plant: Plant, source: Source, record: Record, mode: Array) -> float:
+    """Balanced accuracy per sample of declared labels (N, K + 1), as the leaderboards count it."""
+    scored, labels = scored_of(plant, source, record), len(plant.labels)
+    confusion = np.zeros((labels, labels + 1))
+    np.add.at(confusion, (record.label[scored], mode[scored]), 1)
+    return float(balanced_accuracy(confusion))
 
 
 def at_steps(samples: Array, period: int) -> Array:
@@ -161,9 +181,8 @@ def prepare(
         tasks = (joblib.delayed(_elsewhere)(known, plant_id, source, filters, record.obs[i], shape.period) for i in pieces)
         heard = joblib.Parallel(n_jobs=-1)(tasks)
         seen.append(np.concatenate([np.concatenate(piece, axis=2) for piece in heard]))  # type: ignore[arg-type]
-    scoring = plant.process(source.process).scoring
-    scored = np.stack([scored_samples(record.label[i], int(record.length[i]), scoring) for i in range(n)])
-    truth = [at_steps(a, shape.period)[:, :T] for a in (record.label, ident.deviation(plant, record.target), scored)]
+    parts = (record.label, ident.deviation(plant, record.target), scored_of(plant, source, record))
+    truth = [at_steps(a, shape.period)[:, :T] for a in parts]
     return Flights(np.concatenate(seen, axis=2), truth[0], truth[1].astype(np.float32), truth[2], process), record
 
 

@@ -10,9 +10,8 @@ own, so a checkpoint at its end needs the weights, the optimiser's moments, the 
 
 from __future__ import annotations
 
-import json
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +19,18 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
-from safetensors import safe_open
-from safetensors.numpy import save
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
+from baselines.networks import checkpoints, weights
 from baselines.networks import flights as data
-from baselines.networks import weights
 from baselines.networks.flights import PER_SEED, TRAINING, VALIDATION, Source
 from baselines.networks.identification import Model, Shape
 from baselines.networks.observed import IdentifiedFeatures
 from baselines.networks.policy import actor_tensors, streaming
 from fdi_gym.diagnosis import run
-from fdi_gym.evaluation import write_whole
-from fdi_gym.metrics import balanced_accuracy, scored_samples
 from fdi_gym.plant import Array
 from fdi_gym.sb3 import FDIVecEnv
 from fdi_gym.simulation import Record
@@ -113,6 +108,7 @@ class Run:
         self.plant = self.plants[0]
         self.first = TRAINING + PER_SEED * seed
         per_leg = recipe.envs * recipe.steps * recipe.updates
+        self.identity = checkpoints.identity(method, self.plant, seed, recipe)
         self.legs, self.per_leg = max(1, round(recipe.decisions / per_leg)), per_leg
         self.leg, self.seconds, self.curve = 0, 0.0, []
         self.started = time.perf_counter()
@@ -127,15 +123,11 @@ class Run:
         """Identify the plant, and make a new policy."""
         seeds = range(self.first, self.first + self.recipe.identify)
         records = [data.fly(p, s, seeds) for p, s in zip(self.plants, self.recipe.sources, strict=True)]
-        share = np.stack([self.share_of(index) for index in range(len(self.plants))])
+        share = np.stack([
+            data.label_share(plant, source, [seed for leg in range(4) for seed in self.seeds_of(leg, index)])
+            for index, (plant, source) in enumerate(zip(self.plants, self.recipe.sources, strict=True))
+        ])  # fmt: skip
         self.make(data.identified(self.plants, self.recipe.shape, records), share)
-
-    def share_of(self, index: int) -> Array:
-        """Share of each label in the first training flights of a process, as they are planned."""
-        plant, source = self.plants[index], self.recipe.sources[index]
-        seeds = [seed for leg in range(4) for seed in self.seeds_of(leg, index)]
-        rows = [plant.label_rows(data.draw(plant.process(source.process), seed)) for seed in seeds]
-        return np.bincount(np.concatenate(rows), minlength=len(plant.labels)) / sum(map(len, rows))
 
     def seeds_of(self, leg: int, index: int) -> list[int]:
         """The seeds of the flights that a leg begins with."""
@@ -169,36 +161,20 @@ class Run:
             envs = DelayAwareReward(envs, r.patience, np.minimum(weight, HEAVIEST).tolist())
         return FDIVecEnv(IdentifiedFeatures(envs, plant, r.shape, self.model))
 
-    def identity(self) -> str:
-        """What a checkpoint must share with the run that goes on from it."""
-        return json.dumps({"method": self.method, "plant": self.plant.env_id, "seed": self.seed, **asdict(self.recipe)})
-
     def save(self) -> None:
-        """Write the checkpoint whole."""
-        tensors = {f"policy.{k}": v.cpu().numpy() for k, v in self.agent.policy.state_dict().items()}
+        """Write the checkpoint."""
+        policy = self.agent.policy
+        tensors = {f"policy.{k}": v for k, v in policy.state_dict().items()}
         tensors |= {"share": self.share, **{f"model.{k}": a for k, a in self.model._asdict().items()}}
-        for i, moments in self.agent.policy.optimizer.state_dict()["state"].items():
-            tensors |= {f"adam.{i}.{k}": v.cpu().numpy() for k, v in moments.items()}
-        state = {"leg": self.leg, "seconds": self.seconds, "curve": self.curve, "run": self.identity()}
-        write_whole(self.checkpoint, save(tensors, metadata={"state": json.dumps(state)}))
+        state = {"leg": self.leg, "seconds": self.seconds, "curve": self.curve}
+        checkpoints.write(self.checkpoint, self.identity, tensors, policy.optimizer, state)
 
     def restore(self) -> None:
         """Go on from the checkpoint."""
-        tensors = weights.read_tensors(self.checkpoint)
-        with safe_open(self.checkpoint, "np") as file:
-            state = json.loads(file.metadata()["state"])
-        if state["run"] != self.identity():
-            raise ValueError(f"{self.checkpoint} is of a run with another recipe or seed; move it away to begin a new one")
+        tensors, state = checkpoints.read(self.checkpoint, self.identity)
         self.leg, self.seconds, self.curve = state["leg"], state["seconds"], state["curve"]
         self.make(Model(*(tensors[f"model.{name}"] for name in Model._fields)), tensors["share"])
-        policy = self.agent.policy
-        policy.load_state_dict({k: torch.from_numpy(tensors[f"policy.{k}"]) for k in policy.state_dict()})
-        adam = policy.optimizer.state_dict()
-        moments = ("step", "exp_avg", "exp_avg_sq")
-        adam["state"] = {
-            i: {k: torch.from_numpy(tensors[f"adam.{i}.{k}"]) for k in moments} for i in adam["param_groups"][0]["params"]
-        }
-        policy.optimizer.load_state_dict(adam)
+        checkpoints.restore(self.agent.policy, "policy", self.agent.policy.optimizer, tensors)
 
     def one_leg(self) -> float:
         """Fly and learn; the mean reward per decision."""
@@ -226,17 +202,12 @@ class Run:
             self.held_out = [data.fly(p, s, seeds) for p, s in zip(self.plants, r.sources, strict=True)]
         for plant, source, record in zip(self.plants, r.sources, self.held_out, strict=True):
             said = run(streaming(plant, r.shape, self.model, self.tensors(), r.task), record.obs)
-            scoring, labels = plant.process(source.process).scoring, len(plant.labels)
-            confusion, squares = np.zeros((labels, labels + 1)), []
-            for i, (true, length) in enumerate(zip(record.label, record.length, strict=True)):
-                scored = scored_samples(true, int(length), scoring)
-                np.add.at(confusion, (true[scored], said.mode[i, scored].astype(int)), 1)
-                if said.theta is not None:
-                    squares.append(((said.theta[i] - record.target[i]) / [s.scale for s in plant.estimated])[scored] ** 2)
-            if squares:
-                found[f"{source.process} rmse"] = float(np.sqrt(np.concatenate(squares).mean()))
+            if said.theta is None:
+                found[source.process] = data.accuracy(plant, source, record, said.mode)
             else:
-                found[source.process] = float(balanced_accuracy(confusion))
+                error = (said.theta - record.target) / [s.scale for s in plant.estimated]
+                scored = data.scored_of(plant, source, record)
+                found[f"{source.process} rmse"] = float(np.sqrt((error[scored] ** 2).mean()))
         return found
 
     def run(self, stop_after: int | None = None) -> Path:

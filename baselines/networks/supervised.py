@@ -6,27 +6,22 @@ moments and that place; a resumed run ends with the same bytes as one that was n
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from safetensors import safe_open
-from safetensors.numpy import save
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from baselines.networks import calibration, weights
+from baselines.networks import calibration, checkpoints, weights
 from baselines.networks import flights as data
 from baselines.networks.flights import CALIBRATION, PER_SEED, TRAINING, VALIDATION, Flights, Source
 from baselines.networks.identification import Model, Shape
 from baselines.networks.network import SequenceNetwork, loss
-from fdi_gym.evaluation import write_whole
-from fdi_gym.metrics import balanced_accuracy
 from fdi_gym.plant import Array
 from fdi_gym.simulation import Record
 
@@ -112,6 +107,7 @@ class Run:
         self.plants = [data.plant_of(plant_id, source) for source in recipe.sources]
         self.plant = self.plants[0]
         self.first = TRAINING + PER_SEED * seed
+        self.identity = checkpoints.identity(method, self.plant, seed, recipe)
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.per_pass = -(-recipe.chunk * len(recipe.sources) // recipe.batch)
         self.total = -(-recipe.flights // recipe.chunk) * recipe.passes
@@ -128,9 +124,11 @@ class Run:
     def make(self, model: Model) -> None:
         """The network and its optimiser."""
         p, recipe = self.plant, self.recipe
-        obs = data.fly(p, recipe.sources[0], [self.first]).obs[:, : 2 * recipe.shape.period]
-        heard = data.words(self.plant_id, recipe.sources[0], recipe.filters, obs, recipe.shape.period)
-        words = tuple(word.shape[-1] for word in heard)
+        words: tuple[int, ...] = ()
+        if recipe.filters:
+            obs = data.fly(p, recipe.sources[0], [self.first]).obs[:, : 2 * recipe.shape.period]
+            heard = data.words(self.plant_id, recipe.sources[0], recipe.filters, obs, recipe.shape.period)
+            words = tuple(word.shape[-1] for word in heard)
         width = len(model.mean) + len(recipe.sources) + sum(words)
         shape = (width, len(p.labels), len(p.estimated), recipe.hidden, words, len(recipe.sources))
         self.network = SequenceNetwork(*shape).to(self.device)
@@ -152,14 +150,11 @@ class Run:
         else:
             model = data.identified(self.plants, recipe.shape, records)
             self.make(model)
-        share = np.stack([self.share_of(i) for i in range(len(recipe.sources))]) if recipe.candidates > 1 else prior
+        share = prior
+        if recipe.candidates > 1:  # of the flights that are chosen
+            planned = enumerate(zip(self.plants, recipe.sources, strict=True))
+            share = np.stack([data.label_share(p, s, self.seeds_of(0, i)) for i, (p, s) in planned])
         self.progress = Progress(model, np.maximum(prior, 1e-4), share)
-
-    def share_of(self, index: int) -> Array:
-        """Share of each label in the first chunk of training flights of a source, as they are planned."""
-        plant, source = self.plants[index], self.recipe.sources[index]
-        rows = [plant.label_rows(data.draw(plant.process(source.process), seed)) for seed in self.seeds_of(0, index)]
-        return np.bincount(np.concatenate(rows), minlength=len(plant.labels)) / sum(map(len, rows))
 
     def seeds_of(self, chunk: int, index: int) -> list[int]:
         """The seeds of a source's flights in a chunk."""
@@ -182,39 +177,21 @@ class Run:
                 old = torch.cat([old[:, :at], torch.zeros(len(old), plain), old[:, at:]], dim=1)
             value.copy_(old)
 
-    def identity(self) -> str:
-        """What a checkpoint must share with the run that goes on from it."""
-        return json.dumps({"method": self.method, "plant": self.plant.env_id, "seed": self.seed, **asdict(self.recipe)})
-
     def save(self) -> None:
-        """Write the checkpoint whole."""
+        """Write the checkpoint."""
         p = self.progress
-        tensors = {f"network.{k}": v.cpu().numpy() for k, v in self.network.state_dict().items()}
+        tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
         tensors |= {f"model.{k}": a for k, a in p.model._asdict().items()} | {"prior": p.prior, "share": p.share}
-        for i, moments in self.optimiser.state_dict()["state"].items():
-            tensors |= {f"adam.{i}.{k}": np.asarray(v.cpu().numpy()) for k, v in moments.items()}
-        state = {"passes": p.passes, "steps": p.steps, "seconds": p.seconds, "curve": p.curve, "run": self.identity()}
-        tensors = {k: np.asarray(v, order="C") for k, v in tensors.items()}
-        write_whole(self.checkpoint, save(tensors, metadata={"state": json.dumps(state)}))
+        state = {"passes": p.passes, "steps": p.steps, "seconds": p.seconds, "curve": p.curve}
+        checkpoints.write(self.checkpoint, self.identity, tensors, self.optimiser, state)
 
     def restore(self) -> None:
         """Go on from the checkpoint."""
-        tensors = weights.read_tensors(self.checkpoint)
-        with safe_open(self.checkpoint, "np") as file:
-            state = json.loads(file.metadata()["state"])
-        if state.pop("run") != self.identity():
-            raise ValueError(f"{self.checkpoint} is of a run with another recipe or seed; move it away to begin a new one")
-        self.progress = Progress(
-            Model(*(tensors[f"model.{k}"] for k in Model._fields)), tensors["prior"], tensors["share"], **state
-        )
-        self.make(self.progress.model)
-        self.network.load_state_dict({k: torch.from_numpy(tensors[f"network.{k}"]) for k in self.network.state_dict()})
-        adam = self.optimiser.state_dict()
-        names = ("step", "exp_avg", "exp_avg_sq")
-        adam["state"] = {
-            i: {k: torch.from_numpy(tensors[f"adam.{i}.{k}"]) for k in names} for i in adam["param_groups"][0]["params"]
-        }
-        self.optimiser.load_state_dict(adam)
+        tensors, state = checkpoints.read(self.checkpoint, self.identity)
+        model = Model(*(tensors[f"model.{k}"] for k in Model._fields))
+        self.progress = Progress(model, tensors["prior"], tensors["share"], **state)
+        self.make(model)
+        checkpoints.restore(self.network, "network", self.optimiser, tensors)
 
     # -- training
 
@@ -271,16 +248,11 @@ class Run:
 
     def accuracy(self, flown: Flights, records: list[Record]) -> dict[str, float]:
         """Balanced accuracy per sample of each process, as the leaderboards count it."""
-        labels, found = len(self.plant.labels), {}
-        declared = self.logits(flown).argmax(axis=2)
+        found, declared = {}, self.logits(flown).argmax(axis=2)
         for index, (plant, source, record) in enumerate(zip(self.plants, self.recipe.sources, records, strict=True)):
             mine = declared[flown.process == index]
             mode = data.at_samples(mine, self.recipe.shape.period, record.label.shape[1])
-            scoring, confusion = plant.process(source.process).scoring, np.zeros((labels, labels + 1))
-            for i, (true, length) in enumerate(zip(record.label, record.length, strict=True)):
-                scored = data.scored_samples(true, int(length), scoring)
-                np.add.at(confusion, (true[scored], mode[i, scored]), 1)
-            found[source.process] = float(balanced_accuracy(confusion))
+            found[source.process] = data.accuracy(plant, source, record, mode)
         return found
 
     def run(self, stop_after: int | None = None) -> Path:
