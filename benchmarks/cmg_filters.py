@@ -96,7 +96,7 @@ def main(arguments: Arguments) -> None:
             state = diagnoser.init(len(obs))
             for k in range(obs.shape[1]):
                 state, said = diagnoser.update(state, obs[:, k])
-            return said.theta
+            return said.estimate
 
         return go
 

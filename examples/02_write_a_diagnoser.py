@@ -40,4 +40,4 @@ if __name__ == "__main__":
     check_diagnoser(lambda plant, scenarios: mean_innovation_test(plant), plant)
     flights = simulate(plant, [draw(plant.process("standard"), seed) for seed in range(100)])
     said = run(mean_innovation_test(plant), flights.obs)
-    print("right labels:", (said.mode == flights.label)[:, 1:].mean().round(3))
+    print("right labels:", (said.label == flights.label)[:, 1:].mean().round(3))

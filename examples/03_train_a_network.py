@@ -32,4 +32,4 @@ if __name__ == "__main__":
     plant = load_plant("B747Lateral")
     seen = simulate(plant, [draw(plant.process("standard"), seed) for seed in range(20)])
     said = run(make_diagnoser("sequence_net", plant, path=str(path)), seen.obs)
-    print("right labels:", (said.mode == seen.label)[:, 1:].mean().round(3))
+    print("right labels:", (said.label == seen.label)[:, 1:].mean().round(3))

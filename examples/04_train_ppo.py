@@ -32,4 +32,4 @@ if __name__ == "__main__":
     said = run(from_sb3(model.policy, plant, decision_period=10, length=12), flights.obs)
     for index, label in enumerate(plant.labels):
         mine = flights.label[:, 1:] == index
-        print(f"{label.name:15s} {(said.mode[:, 1:][mine] == index).mean():.3f} of {mine.sum()} samples right")
+        print(f"{label.name:15s} {(said.label[:, 1:][mine] == index).mean():.3f} of {mine.sum()} samples right")

@@ -32,14 +32,15 @@ from fdi_gym.plant import Array, Plant, contiguous
 class Diagnosis(NamedTuple):
     """What a diagnoser says after a sample about the interval that has just ended, for n episodes.
 
-    A method that does not isolate gives mode 0 or any guess with its alarm; one that does not estimate gives theta None.
+    A method that does not isolate gives label 0 or any guess with its alarm; what a method does not give is None.
     """
 
     alarm: Array  # (n,) bool: there is a fault
-    mode: Array  # (n,) int: label index
-    theta: Array | None = None  # (n, n_estimated) estimate of what the identification task asks for
-    theta_std: Array | None = None  # (n, n_estimated) its standard deviation
-    mode_probs: Array | None = None  # (n, labels) probabilities, where the method has them
+    label: Array  # (n,) int: label index
+    estimate: Array | None = None  # (n, n_estimated) estimate of what the identification task asks for
+    estimate_std: Array | None = None  # (n, n_estimated) its standard deviation
+    label_probs: Array | None = None  # (n, labels) probabilities, where the method has them
+    state: Array | None = None  # (n, n_x) estimate of the plant's state
     signals: dict[str, Array] | None = None  # (n, ...) each: residuals, thresholds, an approximated fault function
 
 
@@ -186,28 +187,29 @@ def _choose(mask: Array, yes: Any, no: Any) -> Any:
 
 def _normal(plant: Plant, n: int, diagnosis: Diagnosis) -> Diagnosis:
     """The diagnosis with its arrays in their declared types."""
-    mode = np.asarray(diagnosis.mode, dtype=np.int64)
+    label = np.asarray(diagnosis.label, dtype=np.int64)
     alarm = np.asarray(diagnosis.alarm, dtype=bool)
-    for name, value, shape in (("alarm", alarm, (n,)), ("mode", mode, (n,))):
+    for name, value, shape in (("alarm", alarm, (n,)), ("label", label, (n,))):
         if value.shape != shape:
             raise ValueError(f"a diagnosis has {name} of shape {shape}, not {value.shape}")
     for name, width in (
-        ("theta", len(plant.estimated)),
-        ("theta_std", len(plant.estimated)),
-        ("mode_probs", len(plant.labels)),
+        ("estimate", len(plant.estimated)),
+        ("estimate_std", len(plant.estimated)),
+        ("label_probs", len(plant.labels)),
+        ("state", len(plant.states)),
     ):
         value = getattr(diagnosis, name)
         if value is not None and np.shape(value) != (n, width):
             raise ValueError(f"a diagnosis has {name} of shape {(n, width)} or None, not {np.shape(value)}")
-    return diagnosis._replace(alarm=alarm, mode=mode)
+    return diagnosis._replace(alarm=alarm, label=label)
 
 
 def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
     """The diagnoser as the evaluation runs it.
 
     A sample with a non-finite value in it is a dropout: that episode's diagnoser does not see it and repeats its last
-    word. An episode whose estimate leaves the numbers, or whose update fails in linear algebra, is lost: mode -1, which
-    is never right, and theta NaN, from there to its end. The other episodes of the batch are not touched.
+    word. An episode whose estimate leaves the numbers, or whose update fails in linear algebra, is lost: label -1, which
+    is never right, and estimate NaN, from there to its end. The other episodes of the batch are not touched.
 
     Raises (from update):
         ValueError: obs has the wrong shape, or the diagnoser's answer does.
@@ -216,7 +218,7 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
 
     def init(n: int) -> Any:
         theta = np.tile(plant.estimate_target(plant.nominal_theta, plant.trim_command), (n, 1))
-        healthy = Diagnosis(np.zeros(n, bool), np.zeros(n, np.int64), theta, np.full_like(theta, np.nan), None)
+        healthy = Diagnosis(np.zeros(n, bool), np.zeros(n, np.int64), theta, np.full_like(theta, np.nan))
         return raw.init(n), healthy, np.zeros((n, width)), np.zeros(n, bool)
 
     def singly(state: Any, obs: Array) -> tuple[Any, Diagnosis, Array]:
@@ -258,8 +260,8 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
             except np.linalg.LinAlgError:
                 after, answer, failed = singly(inner, obs)
         answer = _normal(plant, n, answer)
-        if answer.theta is not None:
-            failed |= ~np.isfinite(answer.theta).all(axis=1)
+        if answer.estimate is not None:
+            failed |= ~np.isfinite(answer.estimate).all(axis=1)
         if failed.any() or not seen.all():
             fresh = failed & seen
             lost = lost | fresh
@@ -268,8 +270,10 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
                 after = _choose(~fresh, after, raw.init(n))
             kept: Any = Diagnosis._make(b if a is None or b is None else a for a, b in zip(last, answer, strict=True))
             answer = _choose(seen & ~lost, answer, kept)
-            theta = None if answer.theta is None else np.where(lost[:, None], np.nan, answer.theta)
-            answer = answer._replace(alarm=answer.alarm & ~lost, mode=np.where(lost, -1, answer.mode), theta=theta)
+            lines = {
+                k: np.where(lost[:, None], np.nan, a) for k in ("estimate", "state") if (a := getattr(answer, k)) is not None
+            }
+            answer = answer._replace(alarm=answer.alarm & ~lost, label=np.where(lost, -1, answer.label), **lines)
         return (after, answer, obs, lost), answer
 
     return Diagnoser(init, update)
@@ -279,10 +283,11 @@ class Decisions(NamedTuple):
     """What a diagnoser said over recorded flights: the fields of `Diagnosis` with samples along the second axis."""
 
     alarm: Array  # (N, K + 1) bool
-    mode: Array  # (N, K + 1) int16
-    theta: Array | None  # (N, K + 1, n_estimated)
-    theta_std: Array | None
-    mode_probs: Array | None  # (N, K + 1, labels)
+    label: Array  # (N, K + 1) int16
+    estimate: Array | None  # (N, K + 1, n_estimated)
+    estimate_std: Array | None
+    label_probs: Array | None  # (N, K + 1, labels)
+    state: Array | None = None  # (N, K + 1, n_x)
     signals: dict[str, Array] | None = None  # (N, K + 1, ...) each, where they were asked for
 
 
@@ -296,12 +301,12 @@ def run(diagnoser: Diagnoser, obs: Array, signals: bool = False) -> Decisions:
     """
     n, samples, _ = obs.shape
     state = diagnoser.init(n)
-    alarm, mode = np.zeros((n, samples), bool), np.zeros((n, samples), np.int16)
-    wide: dict[str, Array | None] = {"theta": None, "theta_std": None, "mode_probs": None}
+    alarm, label = np.zeros((n, samples), bool), np.zeros((n, samples), np.int16)
+    wide: dict[str, Array | None] = dict.fromkeys(("estimate", "estimate_std", "label_probs", "state"))
     own: dict[str, Array] = {}
     for k in range(samples):
         state, said = diagnoser.update(state, obs[:, k])
-        alarm[:, k], mode[:, k] = said.alarm, said.mode
+        alarm[:, k], label[:, k] = said.alarm, said.label
         for name in wide:
             value = getattr(said, name)
             if value is not None:
@@ -311,4 +316,4 @@ def run(diagnoser: Diagnoser, obs: Array, signals: bool = False) -> Decisions:
                 store[:, k] = value
         for name, value in (said.signals or {}).items() if signals else ():
             own.setdefault(name, np.full((n, samples, *value.shape[1:]), np.nan))[:, k] = value
-    return Decisions(alarm, mode, **wide, signals=own or None)
+    return Decisions(alarm, label, **wide, signals=own or None)

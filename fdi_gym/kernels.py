@@ -114,7 +114,7 @@ def _lazily(function: Callable[..., Any], signature: Any) -> Any:
     return dispatcher
 
 
-def _compiled(dispatcher: Any) -> Any:
+def _load(dispatcher: Any) -> Any:
     """The dispatcher, compiled for its role's signature or loaded from the cache."""
     if not dispatcher.overloads:
         source = dispatcher.py_func.__code__.co_filename
@@ -141,7 +141,7 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 def address(dispatcher: Any) -> int:
     """The address of a kernel, compiled if need be, by which the generic kernels call it. Valid as long as it lives."""
-    (result,) = _compiled(dispatcher).overloads.values()
+    (result,) = _load(dispatcher).overloads.values()
     return result.library.get_pointer_to_function(result.fndesc.llvm_func_name)
 
 
@@ -162,7 +162,7 @@ def _function_at(signature: Any) -> Any:
     return function_at
 
 
-_map_at, _control_at, _known_at = _function_at(_MAP), _function_at(_CONTROL), _function_at(_KNOWN)
+map_at, _control_at, _known_at = _function_at(_MAP), _function_at(_CONTROL), _function_at(_KNOWN)
 _project_at, _outside_at = _function_at(_PROJECT), _function_at(_OUTSIDE)
 
 
@@ -190,7 +190,7 @@ def outside(t, x, r):
 # Generic kernels
 
 
-def _generic(signature: Any) -> Callable[[Any], Any]:
+def compiled(signature: Any) -> Callable[[Any], Any]:
     """Make a generic kernel of this file: compiled for this signature at its first call, cached."""
 
     def decorate(function: Callable[..., Any]) -> Any:
@@ -198,7 +198,7 @@ def _generic(signature: Any) -> Callable[[Any], Any]:
 
         @functools.wraps(function)
         def call(*arguments: Any) -> Any:
-            return _compiled(dispatcher)(*arguments)
+            return _load(dispatcher)(*arguments)
 
         return call
 
@@ -246,10 +246,10 @@ def _advance(dynamics, project, t, dt, substeps, x, u, a, b, g, d, p, theta, k1,
     project(x, theta)
 
 
-@_generic(void(int64, int64, float64, int64, V, M, M, M, M, M, M))
+@compiled(void(int64, int64, float64, int64, V, M, M, M, M, M, M))
 def propagate(dynamics_at, project_at, dt, substeps, t, x, u, theta, d, p, out):
     """out[i] = the state one sample after x[i]; t, u, theta, d, p have m rows that serve M/m consecutive points each."""
-    dynamics, project = _map_at(dynamics_at), _project_at(project_at)
+    dynamics, project = map_at(dynamics_at), _project_at(project_at)
     points, n = x.shape
     xi, ui, ti, di, pi = (
         np.empty(n),
@@ -278,10 +278,10 @@ def propagate(dynamics_at, project_at, dt, substeps, t, x, u, theta, d, p, out):
             out[i, j] = xi[j]
 
 
-@_generic(void(int64, V, M, M, M, M, M, M))
+@compiled(void(int64, V, M, M, M, M, M, M))
 def evaluate(function_at, t, x, u, theta, d, p, out):
     """out[i] = function(t, x[i], ...): the sensors' values or the state's rate of change, rows served as in `propagate`."""
-    function = _map_at(function_at)
+    function = map_at(function_at)
     points = x.shape[0]
     xi, ui, ti = np.empty(x.shape[1]), np.empty(u.shape[1]), np.empty(theta.shape[1])
     di, pi, oi = np.empty(d.shape[1]), np.empty(p.shape[1]), np.empty(out.shape[1])
@@ -303,7 +303,7 @@ def evaluate(function_at, t, x, u, theta, d, p, out):
             out[i, j] = oi[j]
 
 
-@_generic(void(float64[:, :, ::1], float64[:, :, ::1], float64[:, :, ::1]))
+@compiled(void(float64[:, :, ::1], float64[:, :, ::1], float64[:, :, ::1]))
 def solve(A, B, out):
     """out[i] = A[i]^-1 B[i]: Gaussian elimination with partial pivoting, for many small systems; not finite if singular.
 
@@ -341,7 +341,7 @@ def solve(A, B, out):
                 out[i, r, c] = total / a[r, r]
 
 
-@_generic(void(float64[:, :, :, ::1], float64[:, :, ::1], M, M, float64[:, :, ::1], M))
+@compiled(void(float64[:, :, :, ::1], float64[:, :, ::1], M, M, float64[:, :, ::1], M))
 def box_minimum(G, g, low, high, m, value):
     """value[i, h] = min of m' G m - 2 g' m over low[h] <= m <= high[h], for positive definite G[i, h]; m is where.
 
@@ -399,7 +399,7 @@ def box_minimum(G, g, low, high, m, value):
                         break  # the minimum of all m lies inside
 
 
-@_generic(
+@compiled(
     int64(
         int64,
         int64,
@@ -470,7 +470,7 @@ def simulate(
     `holds` has the rows (theta entry, first step, end step, command index, lag): from the first step on the entry holds
     the command of `lag` steps before. Returns the number of steps flown, negative where the flight ended early.
     """
-    dynamics, output, control = _map_at(dynamics_at), _map_at(output_at), _control_at(control_at)
+    dynamics, output, control = map_at(dynamics_at), map_at(output_at), _control_at(control_at)
     known, project, outside = _known_at(known_at), _project_at(project_at), _outside_at(outside_at)
     steps, n = w.shape
     p_theta, n_y, n_u = TH.shape[1], v.shape[1], u0.size

@@ -114,7 +114,7 @@ def _onsets(label: Array, alarm: Array, mode: Array, length: int) -> list[Onset]
 def outcome(plant: Plant, scoring: Scoring, record: Record, said: Decisions, i: int) -> Outcome:
     """Reduce episode i of a record, and what was said about it, to counts."""
     length = int(record.length[i])
-    label, mode, alarm = record.label[i], said.mode[i].astype(np.int64), said.alarm[i]
+    label, mode, alarm = record.label[i], said.label[i].astype(np.int64), said.alarm[i]
     scored = scored_samples(label, length, scoring)
     pairs, counts = np.unique(np.column_stack([label[scored], mode[scored]]), axis=0, return_counts=True)
     band = severity_bands(plant, label, record.theta[i])
@@ -125,15 +125,15 @@ def outcome(plant: Plant, scoring: Scoring, record: Record, said: Decisions, i: 
     phase = np.where(label > 0, 1, np.where(np.arange(len(label)) < first_fault, 0, 2))
     phase[(np.arange(len(label)) < scoring.start) | (np.arange(len(label)) > length)] = -1
     squares, steps = [[0.0] * len(plant.estimated) for _ in PHASES], [0] * len(PHASES)
-    if said.theta is not None:
-        error = (said.theta[i] - record.target[i]) ** 2
+    if said.estimate is not None:
+        error = (said.estimate[i] - record.target[i]) ** 2
         phase[~np.isfinite(error).all(axis=1)] = -1  # a lost filter has no estimate; `lost` counts it
         for p in range(len(PHASES)):
             squares[p] = [float(v) for v in error[phase == p].sum(axis=0)]
             steps[p] = int((phase == p).sum())
     log_score = None
-    if said.mode_probs is not None:
-        log_score = float(np.log(np.maximum(said.mode_probs[i, scored, label[scored]], 1e-12)).sum())
+    if said.label_probs is not None:
+        log_score = float(np.log(np.maximum(said.label_probs[i, scored, label[scored]], 1e-12)).sum())
     return Outcome(
         steps=length, terminated=bool(record.terminated[i]), lost=bool((mode[1 : length + 1] < 0).any()),
         decision=(true, declared), band=int(band[about]) if true > 0 else None,

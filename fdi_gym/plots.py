@@ -121,7 +121,7 @@ def flight(plant: Plant, record: Record, said: dict[str, Any], i: int = 0, entri
     """
     from matplotlib.figure import Figure
 
-    estimates = {name: d for name, d in said.items() if d.theta is not None}
+    estimates = {name: d for name, d in said.items() if d.estimate is not None}
     shown = list(range(min(len(plant.estimated), 4))) if entries is None else list(entries)
     rows = 1 + len(shown)
     figure = Figure(figsize=(9.6, 1.6 + 1.5 * rows), dpi=120, layout="constrained")
@@ -131,13 +131,13 @@ def flight(plant: Plant, record: Record, said: dict[str, Any], i: int = 0, entri
     colours = [SAID, "#e0a030", "#4c9f70", "#7b5ea7", INK]
     axes[0].step(t, record.label[i, :length], where="post", color=TRUTH, lw=3.5, alpha=0.5, label="truth")
     for colour, (name, decisions) in zip(colours, said.items(), strict=False):
-        axes[0].step(t, decisions.mode[i, :length], where="post", color=colour, lw=1.1, label=name)
+        axes[0].step(t, decisions.label[i, :length], where="post", color=colour, lw=1.1, label=name)
     axes[0].set_yticks(range(len(plant.labels)), [entry.name for entry in plant.labels], fontsize=7)
     for j, axis in zip(shown, axes[1:], strict=True):
         axis.plot(t, record.target[i, :length, j], color=TRUTH, lw=3.5, alpha=0.5)
         for colour, (name, decisions) in zip(colours, said.items(), strict=False):
             if name in estimates:
-                axis.plot(t, decisions.theta[i, :length, j], color=colour, lw=0.9)
+                axis.plot(t, decisions.estimate[i, :length, j], color=colour, lw=0.9)
         axis.set_ylabel(f"{plant.estimated[j].name} {plant.estimated[j].unit}", fontsize=8)
     for axis in axes:
         _dress(axis, record.label[i, :length], plant.dt)

@@ -214,13 +214,13 @@ def check_diagnoser(
     said = run(fresh(everyone), obs, signals=True)
     shown = _arrays(said)
     n_labels = len(plant.labels)
-    assert ((said.mode >= -1) & (said.mode < n_labels)).all(), "a mode is no label"
-    if said.mode_probs is not None:
-        probs = said.mode_probs
+    assert ((said.label >= -1) & (said.label < n_labels)).all(), "a mode is no label"
+    if said.label_probs is not None:
+        probs = said.label_probs
         assert (probs >= -1e-9).all(), "a probability is negative"
         assert np.allclose(probs.sum(axis=2), 1, atol=1e-6), "probabilities do not sum to 1"
-    if said.theta_std is not None:
-        assert not (said.theta_std < 0).any(), "a standard deviation is negative"
+    if said.estimate_std is not None:
+        assert not (said.estimate_std < 0).any(), "a standard deviation is negative"
     _equal(shown, _arrays(run(fresh(everyone), obs, signals=True)), "a second run differs: not deterministic")
     alone = _arrays(run(fresh([2]), obs[2:3], signals=True))
     _equal(_pick(shown, slice(2, 3)), alone, "an episode depends on its batch", 1e-6)
@@ -241,8 +241,8 @@ def check_diagnoser(
     hurt = run(fresh(everyone), holes, signals=True)
     rest = [0, 2, 3]
     _equal(_pick(shown, rest), _pick(_arrays(hurt), rest), "a NaN in one episode reaches another", 1e-6)
-    assert (hurt.mode[1] >= 0).all(), "a dropout loses the episode"
-    assert hurt.theta is None or np.isfinite(hurt.theta[1]).all(), "a dropout leaves a NaN in the estimate"
+    assert (hurt.label[1] >= 0).all(), "a dropout loses the episode"
+    assert hurt.estimate is None or np.isfinite(hurt.estimate[1]).all(), "a dropout leaves a NaN in the estimate"
 
 
 def _arrays(said: Decisions) -> dict[str, Array]:

@@ -322,9 +322,9 @@ def test_a_lost_episode_is_counted_and_stays_alone():
     obs = np.full((3, 10, 6), 0.01)
     obs[1] = 5.0
     said = run(guarded(raw, plant), obs)
-    assert (said.mode[1, 4:] == -1).all()
-    assert (said.mode[[0, 2]] == 0).all()
-    assert np.isfinite(said.theta[[0, 2]]).all()
+    assert (said.label[1, 4:] == -1).all()
+    assert (said.label[[0, 2]] == 0).all()
+    assert np.isfinite(said.estimate[[0, 2]]).all()
 
 
 @pytest.mark.slow
@@ -336,7 +336,7 @@ def test_accuracy_on_the_standard_process():
     acc = {}
     for name in ("two_stage_kf", "two_stage_kf_directional", "restart_kf", "bayes_bank", "known_onset_oracle"):
         known = {"scenarios": scenarios} if name == "known_onset_oracle" else {}
-        acc[name] = (run(make_diagnoser(name, plant, **known), record.obs).mode == record.label)[:, 1:].mean()
+        acc[name] = (run(make_diagnoser(name, plant, **known), record.obs).label == record.label)[:, 1:].mean()
     reference = {"two_stage_kf": 0.811, "two_stage_kf_directional": 0.905, "restart_kf": 0.909, "bayes_bank": 0.956,
                  "known_onset_oracle": 0.984}  # fmt: skip
     for name, value in reference.items():

@@ -50,7 +50,7 @@ def test_window_bookkeeping(plant):
     assert not found["false_alarm"]
     for samples, name in ((range(300, 600), "pre"), (range(601, 1000), "faulty"), (range(1001, 1501), "post")):
         spoiled = perfect(record)
-        spoiled.theta[0, list(samples), 3] += 1.0
+        spoiled.estimate[0, list(samples), 3] += 1.0
         changed = window_outcome(record, spoiled, 0, 600, 1000)
         assert changed[name] == pytest.approx(0.5)  # one of four units, everywhere
         assert sum(changed[other] for other in ("pre", "faulty", "post")) == pytest.approx(0.5)

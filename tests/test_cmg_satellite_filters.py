@@ -243,8 +243,8 @@ def test_an_episode_is_the_same_alone_and_in_a_batch(plant, name):
     together = run(make_diagnoser(name, plant), obs)
     for i in range(3):
         alone = run(make_diagnoser(name, plant), obs[i : i + 1])
-        np.testing.assert_array_equal(alone.theta[0], together.theta[i])
-        np.testing.assert_array_equal(alone.mode[0], together.mode[i])
+        np.testing.assert_array_equal(alone.estimate[0], together.estimate[i])
+        np.testing.assert_array_equal(alone.label[0], together.label[i])
 
 
 def test_mekf_jacobian_is_the_derivative_of_the_step():
@@ -302,8 +302,8 @@ def test_a_fault_is_found_isolated_and_measured(plant, name):
     known = {"scenarios": [scenario]} if name == "mekf_clairvoyant" else {}
     found = run(make_diagnoser(name, plant, **known), record.obs)
     assert not found.alarm[0, :401].any()
-    assert (found.mode[0, 1300:] == plant.label_of(frozenset({"CMG 1", "CMG 3"}))).mean() > 0.95
-    np.testing.assert_allclose(found.theta[0, -1], [0.6, 1.0, 0.3, 1.0], atol=0.05)
+    assert (found.label[0, 1300:] == plant.label_of(frozenset({"CMG 1", "CMG 3"}))).mean() > 0.95
+    np.testing.assert_allclose(found.estimate[0, -1], [0.6, 1.0, 0.3, 1.0], atol=0.05)
 
 
 def test_other_plants_are_refused():

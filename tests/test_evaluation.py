@@ -52,9 +52,9 @@ def test_rows_agree_with_playing_the_environment(suite, rows):
         while True:
             state, said = diagnoser.update(state, obs[None])
             if over:
-                right += float(said.mode[0] == info["label"])
+                right += float(said.label[0] == info["label"])
                 break
-            obs, reward, terminated, truncated, info = env.step(said.mode[0])
+            obs, reward, terminated, truncated, info = env.step(said.label[0])
             right, over = right + reward, terminated or truncated
         counted = sum(c for true, declared, c in row.outcomes[i].confusion if true == declared)
         assert right == counted

@@ -115,7 +115,7 @@ def test_general_filter_is_the_augmented_kf_with_its_tuning(b747, rule):
             assert s.S == pytest.approx(special.S, rel=1e-9, abs=1e-9)
         assert s.X == pytest.approx(special.X, rel=1e-9, abs=1e-9)
         assert s.P == pytest.approx(special.P, rel=1e-9, abs=1e-9)
-        assert s.X[:, 4:] == pytest.approx(said.theta[:, k], rel=1e-9, abs=1e-9)
+        assert s.X[:, 4:] == pytest.approx(said.estimate[:, k], rel=1e-9, abs=1e-9)
 
 
 def test_general_central_difference_filter_is_the_ascdkf_with_its_tuning():
@@ -547,8 +547,8 @@ def test_three_stage_family_is_the_general_augmented_filter_on_the_747(short_cal
     for k, s in enumerate(followed(model, "extended", obs, False)):
         std = np.sqrt(np.einsum("nii->ni", s.P))[:, 4:8]
         tolerance = 1e-6 if process == "gust" else 0.02
-        assert (s.X[:, 4:8] - said.theta[:, k]) / std == pytest.approx(np.zeros((2, 4)), abs=tolerance)
-        assert std == pytest.approx(said.theta_std[:, k], rel=tolerance)
+        assert (s.X[:, 4:8] - said.estimate[:, k]) / std == pytest.approx(np.zeros((2, 4)), abs=tolerance)
+        assert std == pytest.approx(said.estimate_std[:, k], rel=tolerance)
 
 
 def test_flags_are_calibrated_where_the_table_has_no_thresholds(short_calibrations):
@@ -570,9 +570,9 @@ def test_a_plant_brings_tuning_which_a_caller_overrides():
     assert entry.settings_on(plant, b_step=1.0)["b_step"] == 1.0
     assert diagnosers()["augmented_ekf_cusum"].settings_on(plant)["decision"] == "cusum"
     obs = flown(plant)[1].obs[:, :40]
-    theirs = run(make_diagnoser("ascdkf", plant), obs).theta
+    theirs = run(make_diagnoser("ascdkf", plant), obs).estimate
     plain = dataclasses.replace(plant, tuning={})
-    assert np.array_equal(theirs, run(make_diagnoser("ascdkf", plain, **plant.tuning["ascdkf"]), obs).theta)
-    assert not np.allclose(theirs, run(make_diagnoser("ascdkf", plant, b_step=1e-2), obs).theta)
+    assert np.array_equal(theirs, run(make_diagnoser("ascdkf", plain, **plant.tuning["ascdkf"]), obs).estimate)
+    assert not np.allclose(theirs, run(make_diagnoser("ascdkf", plant, b_step=1e-2), obs).estimate)
     with pytest.raises(ValueError, match="null has no setting 'gain'"):
         make_diagnoser("null", dataclasses.replace(plant, tuning={"null": {"gain": 1}}))

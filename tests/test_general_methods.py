@@ -225,7 +225,7 @@ def test_general_forms_agree_with_the_satellites_own():
     record = simulate(plant, scenarios)
     model = augmented(plant, z0_std=[1e-2] * 4, z_walk=[1e-5] * 4)
     s = gaussian.start(model, 2)
-    own = run(joint_ukf(plant), record.obs[:, :2000]).theta
+    own = run(joint_ukf(plant), record.obs[:, :2000]).estimate
     for k in range(2000):
         s = gaussian.advance(model, gaussian.unscented, s, record.obs[:, k])
     jump = np.abs(own[:, -1] - 1.0).max()
@@ -234,7 +234,7 @@ def test_general_forms_agree_with_the_satellites_own():
     a = filter.start(2)
     for k in range(3000):
         a = filter.step(a, record.obs[:, k])
-    theirs = run(sgaukf(plant), record.obs).theta[:, -1]
+    theirs = run(sgaukf(plant), record.obs).estimate[:, -1]
     assert np.abs(1.0 + a.filter.X[:, model.z] - record.theta[:, -1]).max() < 0.05
     assert np.abs(1.0 + a.filter.X[:, model.z] - theirs).max() < 0.06
 
@@ -257,7 +257,7 @@ def test_oracle_is_told_when_and_not_what(plant):
             for i, s in enumerate(scenarios)
         ]
         again = run(make_diagnoser("told_onset_ekf", plant, scenarios=lie), record.obs[:, :400])
-        assert np.array_equal(again.mode, said.mode)
+        assert np.array_equal(again.label, said.label)
 
 
 def test_consistency_of_the_kalman_filter(b747):

@@ -145,8 +145,8 @@ def test_filter_rows_on_the_noise_free_flight(plant, name, b, d):
     obs = simulate(plant, [huav_hover.paper(1)], [no_noise(plant, huav_hover.STEPS)]).obs[:, :451]
     (_, s, _), said = last_state(build(name, plant, channels=P3), obs)
     exact = not name.endswith("ekf")  # the EKF rows depend on the Jacobian at the 1e-9 level
-    assert said.theta[0, 1:] == pytest.approx(b, abs=1e-12 if exact else 1e-8)
-    assert said.theta[0, 0] == 0
+    assert said.estimate[0, 1:] == pytest.approx(b, abs=1e-12 if exact else 1e-8)
+    assert said.estimate[0, 0] == 0
     disturbance = s.x[0, 14:] if name == "ascdkf" else s.d[0]
     assert disturbance == pytest.approx(d, abs=1e-9 if exact else 1e-4 if "robust" in name else 1e-6)
 
@@ -157,7 +157,7 @@ def test_hypothesis_bank_check_values(plant):
     state, seen = diagnoser.init(1), {}
     for k in range(522):
         state, said = diagnoser.update(state, obs[:, k])
-        seen[k - 1] = said.mode_probs[0, 0], said.mode_probs[0, 2], said.theta[0, 1] / MRAD
+        seen[k - 1] = said.label_probs[0, 0], said.label_probs[0, 2], said.estimate[0, 1] / MRAD
     assert seen[512][:2] == pytest.approx((0.966584, 0.003300), rel=2e-4)
     assert seen[513] == pytest.approx((0.002053, 0.978335, 3.66412), rel=2.5e-4)
     assert seen[520][1:] == pytest.approx((0.987608, 5.39050), rel=1e-4)
@@ -406,7 +406,7 @@ def test_robust_filter_follows_any_fault_and_gust_exactly_without_noise(name):
     for k, row in enumerate(shown(model, y)[0]):
         state, said = diagnoser.update(state, row[None])
         if k:
-            assert said.theta[0] == pytest.approx(b[k - 1], abs=1e-7)
+            assert said.estimate[0] == pytest.approx(b[k - 1], abs=1e-7)
             assert state[1].d[0] == pytest.approx(d[k - 1], abs=1e-5)
             assert state[1].x[0] == pytest.approx(x[k], abs=1e-7)
 
@@ -454,7 +454,7 @@ def test_filters_run_on_another_plant_with_a_gust(name):
         tuning |= {"b0_std": 2.0, "b_step": 0.05, "d0_std": 1.0, "d_step": 0.05}
     _, said = last_state(build(name, model, alpha=0.01, **tuning), shown(model, y))
     (_, _, flag), _ = last_state(build(name, model, alpha=0.01, **tuning), shown(model, y))
-    assert flag.s[0] == pytest.approx([3.0, 2.0], abs=4 * 0.01**0.5 * said.theta_std[0].max() + 0.2)
+    assert flag.s[0] == pytest.approx([3.0, 2.0], abs=4 * 0.01**0.5 * said.estimate_std[0].max() + 0.2)
     assert said.alarm[0]
 
 
@@ -532,8 +532,8 @@ def test_diagnoser_conforms(plant, name):
 def test_channels_left_out_are_taken_as_healthy(plant):
     obs = simulate(plant, [huav_hover.paper(3)]).obs[:, :420]
     _, said = last_state(build("three_stage_cdkf", plant, channels=P3), obs)
-    assert said.theta[0, 0] == 0
-    assert said.theta_std[0, 0] == 0
+    assert said.estimate[0, 0] == 0
+    assert said.estimate_std[0, 0] == 0
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -543,12 +543,12 @@ def test_a_lost_filter_is_counted_and_its_neighbours_go_on(plant, name):
     wrecked = obs.copy()
     wrecked[1, 30, :9] = 1e300
     said = run(guarded(build(name, plant), plant), wrecked)
-    assert (said.mode[1, 31:] == -1).all()
-    assert np.isnan(said.theta[1, 31:]).all()
+    assert (said.label[1, 31:] == -1).all()
+    assert np.isnan(said.estimate[1, 31:]).all()
     clean = run(guarded(build(name, plant), plant), obs)
     for i in (0, 2):
-        assert np.array_equal(said.mode[i], clean.mode[i])
-        assert said.theta[i] == pytest.approx(clean.theta[i], rel=1e-9, abs=1e-12)
+        assert np.array_equal(said.label[i], clean.label[i])
+        assert said.estimate[i] == pytest.approx(clean.estimate[i], rel=1e-9, abs=1e-12)
 
 
 # -- slow
@@ -582,7 +582,7 @@ def test_covariances_stay_positive_definite_over_a_long_flight(plant, name):
         for P in covariances(name, state[1]) if k else ():
             assert np.array_equal(P, np.swapaxes(P, -1, -2)), f"sample {k}"
             assert (np.linalg.eigvalsh(P) > 0).all(), f"sample {k}"
-        assert np.isfinite(said.theta).all()
+        assert np.isfinite(said.estimate).all()
 
 
 @pytest.mark.slow
@@ -610,4 +610,4 @@ def test_matched_oracle_attributes_as_the_data_sheet_says(kappa, shares):
     onset, end = np.array([f.onset for f in fault]), np.array([f.end for f in fault])
     for window, share in zip((10, 25, 50, 100), shares, strict=True):
         k = np.minimum(np.minimum(onset + window, end), record.length)
-        assert (said.mode[i, k] == truth).mean() == pytest.approx(share, abs=0.00051)
+        assert (said.label[i, k] == truth).mean() == pytest.approx(share, abs=0.00051)

@@ -101,10 +101,10 @@ def test_streamed_diagnoses_are_those_of_the_whole_sequence(path):
     probs = np.exp(calibration.log_softmax(fitted.scale * logits + np.array(fitted.bias)))
     at = slice(shape.period - 1, None, shape.period)
     unit = np.array([s.scale for s in plant.estimated])
-    assert np.allclose(said.mode_probs[:, at], probs, atol=1e-5)
-    assert np.allclose(identification.deviation(plant, said.theta[:, at]), mean, atol=1e-5)
-    assert np.allclose(said.theta_std[:, at] / unit, np.exp(log_std), rtol=1e-5)
-    assert np.array_equal(said.mode[:, at], logits.argmax(axis=2))
+    assert np.allclose(said.label_probs[:, at], probs, atol=1e-5)
+    assert np.allclose(identification.deviation(plant, said.estimate[:, at]), mean, atol=1e-5)
+    assert np.allclose(said.estimate_std[:, at] / unit, np.exp(log_std), rtol=1e-5)
+    assert np.array_equal(said.label[:, at], logits.argmax(axis=2))
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -169,8 +169,8 @@ def test_a_network_is_told_the_process_and_takes_an_unknown_one_for_the_first(ti
         run(make_diagnoser("sequence_net", plant, path=str(tiny), process=name), obs)
         for name in ("standard", "gust", "hard")
     )
-    assert np.array_equal(first.mode_probs, same.mode_probs)
-    assert not np.allclose(first.mode_probs, other.mode_probs)
+    assert np.array_equal(first.label_probs, same.label_probs)
+    assert not np.allclose(first.label_probs, other.label_probs)
     with pytest.raises(ValueError, match="unknown scenario"):
         make_diagnoser("sequence_net", plant, path=str(tiny), process="no such")
 

@@ -157,7 +157,7 @@ def ratios_at(plant, obs, samples):
         state, said = diagnoser.update(state, obs[:, k])
         alarm.append(said.alarm)
         if k in samples:
-            found[k] = (state[1].llr, state[0].z[:, 1:, 2], said.mode)
+            found[k] = (state[1].llr, state[0].z[:, 1:, 2], said.label)
     return found, np.array(alarm)
 
 
@@ -203,7 +203,7 @@ def test_oracle_evidence(plant, numbered):
     for k in range(2001):
         state, said = diagnoser.update(state, obs[:, k])
         if k in (924, 1741, 2000):
-            log[k] = np.log(np.maximum(said.mode_probs, 1e-300))
+            log[k] = np.log(np.maximum(said.label_probs, 1e-300))
             active = np.array([k > s.faults[0].onset for s in scenarios])
             p = oracle.priors([(0.1, 0.7), (0.1, 0.7), (0.05, 0.40), (0.3, 1.0)], (0.15, 2.0), 0.05, 0.0)
             found = oracle.evidence(state.free, state.window, state.jammed, np.zeros((2, 7)), p).log
@@ -211,7 +211,7 @@ def test_oracle_evidence(plant, numbered):
                 if sample == k:
                     assert active[episode]
                     assert_allclose(found[episode, 1:] - found[episode, 0], expected, rtol=1e-9, atol=1e-9)
-    assert said.mode.tolist() == [5, 2]
+    assert said.label.tolist() == [5, 2]
 
 
 def test_evidence_is_the_direct_gaussian_marginal_likelihood(plant):
@@ -404,8 +404,8 @@ def test_oracle_reads_the_times_only(plant):
     other = missile.study().replace(faults=[missile.fault(3, 0.2, 1.0, 1000)])
     obs = simulate(plant, [scenario]).obs[:, :1100]
     a, b = (run(make_diagnoser("innovation_oracle", plant, scenarios=[s]), obs) for s in (scenario, other))
-    assert (a.mode == b.mode).all()
-    assert (a.mode[0, :1001] == 0).all()
+    assert (a.label == b.label).all()
+    assert (a.label[0, :1001] == 0).all()
 
 
 @pytest.mark.parametrize("name", [*NAMES, "innovation_oracle"])
@@ -444,7 +444,7 @@ def test_randomised_accuracy(plant):
     accuracy = {}
     for name in ("gos", "augmented_ekf_bank", "innovation_oracle"):
         known = {"scenarios": scenarios} if name == "innovation_oracle" else {}
-        mode = run(make_diagnoser(name, plant, **known), record.obs).mode
+        mode = run(make_diagnoser(name, plant, **known), record.obs).label
         at = [np.minimum(onset + 200, 2000), np.minimum(onset + 400, 2000), np.full(len(seeds), 2000)]
         accuracy[name] = [np.mean(mode[np.arange(len(seeds)), k] == label) for k in at]
     assert 0.85 <= accuracy["augmented_ekf_bank"][2] <= 0.96

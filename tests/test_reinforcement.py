@@ -56,13 +56,13 @@ def test_the_stored_actor_is_the_policy(tiny):
     venv.seed(VALIDATION)
     venv.reset()
     said = run(make_diagnoser("ppo", plant, path=str(tiny)), fly(plant, SOURCES[0], range(VALIDATION, VALIDATION + 8)).obs)
-    assert (said.mode[:, :99] == 0).all()
+    assert (said.label[:, :99] == 0).all()
     for k in range(100, 1200, 100):
         obs, _, _, _ = venv.step(np.zeros(8, int))
         with torch.no_grad():
             probs = run_.agent.policy.get_distribution(torch.from_numpy(obs)).distribution.probs.numpy()
-        assert np.allclose(probs, said.mode_probs[:, k - 1], atol=1e-5)
-        assert np.array_equal(said.mode_probs[:, k - 1], said.mode_probs[:, k + 98])
+        assert np.allclose(probs, said.label_probs[:, k - 1], atol=1e-5)
+        assert np.array_equal(said.label_probs[:, k - 1], said.label_probs[:, k + 98])
 
 
 def test_tensors_or_a_card_of_another_shape_are_refused(tiny, tmp_path):
@@ -188,8 +188,8 @@ def test_a_policy_of_your_own_becomes_a_diagnoser():
     model = PPO("MlpPolicy", VecMonitor(venv), n_steps=8, batch_size=16, n_epochs=1, seed=0, device="cpu").learn(32)
     diagnoser = from_sb3(model.policy, plant, decision_period=50, length=2)
     said = run(diagnoser, fly(plant, Source("standard", {}), range(VALIDATION, VALIDATION + 2)).obs[:, :200])
-    assert said.mode_probs is not None
-    assert np.allclose(said.mode_probs.sum(axis=2), 1)
+    assert said.label_probs is not None
+    assert np.allclose(said.label_probs.sum(axis=2), 1)
 
 
 def test_readme_section_is_short():

@@ -270,10 +270,10 @@ def innovation_oracle(
     def silent(said: Diagnosis, active: Array) -> Diagnosis:
         """Outside the windows the answer is none."""
         none = np.eye(6)[np.zeros(len(active), int)]
-        assert said.theta is not None
-        assert said.mode_probs is not None
-        return Diagnosis(said.alarm & active, np.where(active, said.mode, 0), said.theta * active[:, None], None,
-                         np.where(active[:, None], said.mode_probs, none))  # fmt: skip
+        assert said.estimate is not None
+        assert said.label_probs is not None
+        return Diagnosis(said.alarm & active, np.where(active, said.label, 0), said.estimate * active[:, None], None,
+                         np.where(active[:, None], said.label_probs, none))  # fmt: skip
 
     def begin(f: Tracked, begun: Array, sample: Sample) -> Tracked:
         mask = begun[:, None, None]

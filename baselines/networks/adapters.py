@@ -65,7 +65,7 @@ def from_torch(
             return Diagnosis(np.zeros(len(theta), bool), np.zeros(len(theta), np.int64), theta)
         probs = np.exp(answer - answer.max(axis=1, keepdims=True))
         mode = answer.argmax(axis=1)
-        return Diagnosis(mode > 0, mode, mode_probs=probs / probs.sum(axis=1, keepdims=True))
+        return Diagnosis(mode > 0, mode, label_probs=probs / probs.sum(axis=1, keepdims=True))
 
     def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
         k, begun, block, past, said = state

@@ -62,7 +62,7 @@ def streaming(plant: Plant, shape: Shape, model: Model, tensors: Mapping[str, Ar
 
     def init(n: int) -> Any:
         none = np.zeros(n, np.int64)
-        said = Diagnosis(none > 0, none, mode_probs=np.full((n, labels), 1 / labels))
+        said = Diagnosis(none > 0, none, label_probs=np.full((n, labels), 1 / labels))
         return 0, ident.begin(plant, shape, n), said if isolates else Diagnosis(none > 0, none, np.tile(healthy, (n, 1)))
 
     def decide(x: Array) -> Diagnosis:
@@ -72,7 +72,7 @@ def streaming(plant: Plant, shape: Shape, model: Model, tensors: Mapping[str, Ar
             return Diagnosis(none > 0, none, low + (high - low) * (np.clip(found, -1, 1) + 1) / 2)
         probs = np.exp(found - found.max(axis=1, keepdims=True))
         mode = found.argmax(axis=1)
-        return Diagnosis(mode > 0, mode, mode_probs=probs / probs.sum(axis=1, keepdims=True))
+        return Diagnosis(mode > 0, mode, label_probs=probs / probs.sum(axis=1, keepdims=True))
 
     def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
         k, stream, said = state

@@ -202,10 +202,10 @@ class Run:
             self.held_out = [data.fly(p, s, seeds) for p, s in zip(self.plants, r.sources, strict=True)]
         for plant, source, record in zip(self.plants, r.sources, self.held_out, strict=True):
             said = run(streaming(plant, r.shape, self.model, self.tensors(), r.task), record.obs)
-            if said.theta is None:
-                found[source.process] = data.accuracy(plant, source, record, said.mode)
+            if said.estimate is None:
+                found[source.process] = data.accuracy(plant, source, record, said.label)
             else:
-                error = (said.theta - record.target) / [s.scale for s in plant.estimated]
+                error = (said.estimate - record.target) / [s.scale for s in plant.estimated]
                 scored = data.scored_of(plant, source, record)
                 found[f"{source.process} rmse"] = float(np.sqrt((error[scored] ** 2).mean()))
         return found

@@ -84,9 +84,9 @@ def paper_piece(command: str, method: str, seeds: int) -> dict[str, Any]:
     plant = load_plant("B747Lateral")
     scenarios = [paper(command, signs_seed=s).replace(noise_seed=500_000 + s) for s in range(seeds)]
     record, said = watch(plant, scenarios, method)
-    assert said.theta is not None
+    assert said.estimate is not None
     # the reference's filter step k takes (u_k, y_{k+1}): what it says stands at sample k + 1
-    error, mode = (said.theta - record.target)[:, 1:], said.mode[:, 1:]
+    error, mode = (said.estimate - record.target)[:, 1:], said.label[:, 1:]
     pre, faulty, post = slice(500, 2000), slice(2500, 6000), slice(6500, 8000)
 
     def first(condition: Array, start: int) -> list[float | None]:
@@ -113,7 +113,7 @@ def paper_piece(command: str, method: str, seeds: int) -> dict[str, Any]:
                 (faulty, 2),
             )
         ],
-        "mean": said.theta[:, 1:][:, faulty][:, :, [1, 3]].mean(axis=(0, 1)).tolist(),
+        "mean": said.estimate[:, 1:][:, faulty][:, :, [1, 3]].mean(axis=(0, 1)).tolist(),
         "detection": first(mode > 0, 2000),
         "isolation": first(mode == 4, 2000),
         "settled": [settled(1), settled(3)],
@@ -138,11 +138,11 @@ def random_piece(variant: str, method: str, seed: int, per_group: int) -> dict[s
     plant = load_plant("B747Lateral", variant=variant)
     scenarios = episodes(plant, "standard", GROUPS * per_group, seed)
     record, said = watch(plant, scenarios, method)
-    assert said.theta is not None
+    assert said.estimate is not None
     every = 10 if method in ("Bayes bank", "known onset") else 1
     k = np.arange(record.label.shape[1])
     onset = np.array([s.faults[0].onset if s.faults else 10**6 for s in scenarios])[:, None]
-    right, counted = said.mode == record.label, (k >= 1) & (k % every == 0)
+    right, counted = said.label == record.label, (k >= 1) & (k % every == 0)
     masks = {"acc": counted & (k >= 0) & (onset >= 0), "post": counted & (k > onset), "late": counted & (k > onset + 200)}
     groups = np.repeat(np.arange(GROUPS), per_group)
 
@@ -151,13 +151,13 @@ def random_piece(variant: str, method: str, seed: int, per_group: int) -> dict[s
 
     found: dict[str, Any] = {name: shares(mask) for name, mask in masks.items()}
     found["final"] = [float(right[groups == g, -1].mean()) for g in range(GROUPS)]
-    first = np.array([np.flatnonzero(row)[0] if row.any() else -1 for row in said.mode > 0])
+    first = np.array([np.flatnonzero(row)[0] if row.any() else -1 for row in said.label > 0])
     faulty = onset[:, 0] < 10**6
     detected = faulty & (first > onset[:, 0])
     delay = (first - onset[:, 0])[detected] * DT
     found["det"] = float(detected.sum() / faulty.sum())
     found["delay"] = np.percentile(delay, [50, 90]).tolist()
-    error = (said.theta - record.target) ** 2
+    error = (said.estimate - record.target) ** 2
     windows = {
         "pre": (k > 150) & (k <= onset), "transient": (k > onset) & (k <= onset + 200), "late": (k > onset + 200),
     }  # fmt: skip
@@ -169,11 +169,11 @@ def random_piece(variant: str, method: str, seed: int, per_group: int) -> dict[s
     }
     found["rmse_all"] = {name: np.sqrt(error[mask].mean(axis=0)).tolist() for name, mask in windows.items()}
     late = windows["late"] & counted
-    found["confusion"] = [[int(((record.label == a) & (said.mode == b) & late).sum()) for b in range(5)] for a in range(5)]
+    found["confusion"] = [[int(((record.label == a) & (said.label == b) & late).sum()) for b in range(5)] for a in range(5)]
     healthy = episodes(plant, "fault-free", GROUPS * per_group, seed + 50_000)
     if method not in ("Bayes bank", "known onset"):
         _, said = watch(plant, healthy, method)
-        alarms = said.mode > 0
+        alarms = said.label > 0
         found["fa"] = float(alarms.any(axis=1).mean())
         rises = (alarms[:, 1:] & ~alarms[:, :-1]).sum()
         found["fa_h"] = float(rises / (len(healthy) * 1200 * DT / 3600))
@@ -207,13 +207,13 @@ def mismatch_piece(delta: float, method: str, seed: int, count: int) -> dict[str
     record, said = watch(plant, scenarios, method)
     onset = np.array([s.faults[0].onset if s.faults else 10**6 for s in scenarios])[:, None]
     k = np.arange(record.label.shape[1])
-    right = said.mode == record.label
+    right = said.label == record.label
     healthy = [draw(plant.process("fault-free"), seed + 50_000 + i, lambda rng: perturb(rng, delta)) for i in range(count)]
     _, quiet = watch(plant, healthy, method)
     acc = right[:, 1:].mean(axis=1)
     return {
         "acc": float(acc.mean()), "acc_error": float(acc.std() / math.sqrt(count)),
-        "late": float(right[k > onset + 200].mean()), "fa": float((quiet.mode > 0).any(axis=1).mean()), "count": count,
+        "late": float(right[k > onset + 200].mean()), "fa": float((quiet.label > 0).any(axis=1).mean()), "count": count,
     }  # fmt: skip
 
 
@@ -228,7 +228,7 @@ def hard_piece(variant: str, method: str, seed: int, count: int) -> dict[str, An
     scored = np.array([scored_samples(record.label[i], int(record.length[i]), scoring) for i in range(count)])
     if method == "switching Bayes bank":
         scored &= np.arange(scored.shape[1]) % 10 == 0
-    right, faulty = said.mode == record.label, record.label > 0
+    right, faulty = said.label == record.label, record.label > 0
     masks = (scored, scored & faulty, scored & ~faulty)
     return {
         "values": [float(right[m].mean()) for m in masks],
@@ -242,13 +242,13 @@ def dual_piece(method: str, seed: int, count: int) -> dict[str, Any]:
     scenarios = episodes(plant, "dual", count, seed)
     record, said = watch(plant, scenarios, method)
     first = np.array([min((f.onset for f in s.faults), default=10**6) for s in scenarios])[:, None]
-    right = said.mode == record.label
+    right = said.label == record.label
     _, quiet = watch(plant, episodes(plant, "fault-free", count, seed + 50_000), method)
     acc = right[:, 1:].mean(axis=1)
     late = np.arange(right.shape[1]) > first
     return {
         "values": [float(acc.mean()), float(right[late].mean()), float(right[:, -1].mean()),
-                   float((quiet.mode > 0).any(axis=1).mean())],
+                   float((quiet.label > 0).any(axis=1).mean())],
         "acc_error": float(acc.std() / math.sqrt(count)), "count": count,
     }  # fmt: skip
 
@@ -263,7 +263,7 @@ def surface_piece(variant: str, process: str, seed: int, count: int) -> dict[str
     for surface in ("aileron", "rudder"):
         mine = [i for i, s in enumerate(scenarios) if s.faults[0].mode == f"{surface} stuck"]
         late = [(k > scenarios[i].faults[0].onset + 200) & (k <= record.length[i]) for i in mine]
-        right = [(said.mode[i] == record.label[i])[m] for i, m in zip(mine, late, strict=True) if m.any()]
+        right = [(said.label[i] == record.label[i])[m] for i, m in zip(mine, late, strict=True) if m.any()]
         found["late"].append([float(r.mean()) for r in right])
         found["phi"].append(float(np.abs(record.state[mine][:, :, 3]).max()))
     return found

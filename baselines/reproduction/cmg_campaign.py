@@ -83,7 +83,7 @@ def scenarios_of(p: Piece) -> list[FaultScenario]:
 class Watched(NamedTuple):
     """What a method said over a block."""
 
-    theta: Array  # (N, K + 1, 4)
+    estimate: Array  # (N, K + 1, 4)
     label: Array  # (N, K + 1)
     sd: Array  # (N, K + 1) sqrt(trace(P_ff) / 4)
     flag: Array  # (N, K + 1) fault flag or reset
@@ -104,9 +104,9 @@ def watch(plant: Plant, scenarios: list[FaultScenario], record: Record, method: 
     resets = np.zeros(n, np.int64)
     for k in range(samples):
         state, said = diagnoser.update(state, record.obs[:, k])
-        theta[:, k], label[:, k] = said.theta, said.mode
-        assert said.theta_std is not None
-        sd[:, k] = np.sqrt((said.theta_std**2).mean(axis=1))
+        theta[:, k], label[:, k] = said.estimate, said.label
+        assert said.estimate_std is not None
+        sd[:, k] = np.sqrt((said.estimate_std**2).mean(axis=1))
         inner = state[0]
         if hasattr(inner, "beta"):
             flag[:, k] = (inner.beta > BETA_0) & (k > MEMORY + 1)
@@ -132,7 +132,7 @@ def window_outcome(record: Record, said: Watched, i: int, a: int, b: int) -> dic
     """An episode with one window of faulty steps a <= k < b."""
     K = int(record.length[i])
     b = min(b, K)
-    error = said.theta[i] - record.theta[i]
+    error = said.estimate[i] - record.theta[i]
     truth = int(record.label[i, min(a + 1, K)]) if a < b else 0
     half = slice((a + b) // 2, b)
     inside = slice(a + 1, b + 1)
@@ -161,7 +161,7 @@ def window_outcome(record: Record, said: Watched, i: int, a: int, b: int) -> dic
 
 def table4_outcome(record: Record, said: Watched, i: int) -> dict[str, Any]:
     """An episode of the source's time line."""
-    error, K = said.theta[i] - record.theta[i], int(record.length[i])
+    error, K = said.estimate[i] - record.theta[i], int(record.length[i])
     return {
         "pre": rmse(error[500:2000]), "faulty": rmse(error[2001:15000]), "post": rmse(error[15001 : K + 1]),
         "right": float((said.label[i, : K + 1] == record.label[i, : K + 1]).mean()),
@@ -179,9 +179,9 @@ def hard_outcome(plant: Plant, scenario: FaultScenario, record: Record, said: Wa
     last = np.maximum.accumulate(np.where(change, k, -(10**6)))
     last = np.concatenate([[-(10**6)], last[:-1]])
     scored = (k >= 500) & (k - last > 100)
-    truth, error = record.label[i, : K + 1], said.theta[i, : K + 1] - record.theta[i, : K + 1]
+    truth, error = record.label[i, : K + 1], said.estimate[i, : K + 1] - record.theta[i, : K + 1]
     bits = np.array([sum(2**j for j in s) for s in cmg.SETS])
-    wide = ((1.0 - said.theta[i, : K + 1] > 0.08) @ 2 ** np.arange(4)) == bits[truth]
+    wide = ((1.0 - said.estimate[i, : K + 1] > 0.08) @ 2 ** np.arange(4)) == bits[truth]
     right = said.label[i, : K + 1] == truth
     faulty = scored & (truth > 0)
     edges = [0, *np.flatnonzero(change).tolist(), K]

@@ -52,7 +52,7 @@ def tracking_piece(reference: str, every: int = 20) -> dict[str, Any]:
     record = simulate(plant, scenarios)
     found: dict[str, Any] = {"truth": record.theta[0, ::every].tolist()}
     for method in ("SGAUKF", "MEKF", "CLAIR"):
-        found[method] = watch(plant, scenarios, record, method).theta[0, ::every].tolist()
+        found[method] = watch(plant, scenarios, record, method).estimate[0, ::every].tolist()
     return found
 
 

@@ -78,8 +78,8 @@ def watch(diagnoser: Diagnoser, plant: Plant, channels: tuple[str, ...], obs: Ar
             state = outer[0]
             if k == 0:
                 continue
-            assert said.theta is not None
-            found.b[:, k - 1] = said.theta[:, inputs.estimated]
+            assert said.estimate is not None
+            found.b[:, k - 1] = said.estimate[:, inputs.estimated]
             if len(state) == 3:
                 found.s[:, k - 1], found.on[:, k - 1] = state[2].s, state[2].on
                 filtered = state[1]

@@ -229,7 +229,7 @@ def randomised(first_seed: int, runs: int, noise_scale: float = 1.0, fault_scale
     state, modes, alarms = bank.init(runs), [], []
     for k in range(flown.obs.shape[1]):
         state, said = bank.update(state, flown.obs[:, k])
-        modes.append(said.mode)
+        modes.append(said.label)
         alarms.append(said.alarm)
     known = run(make_diagnoser("innovation_oracle", plant, scenarios=scenarios), flown.obs)
     alarms = np.stack(alarms, axis=1)
@@ -241,7 +241,7 @@ def randomised(first_seed: int, runs: int, noise_scale: float = 1.0, fault_scale
     return {
         "label": label.tolist(), "onset": onset.tolist(), "terminated": int(flown.terminated.sum()),
         "gos": at(five["tie_broken"]), "augmented_ekf_bank": at(np.stack(modes, axis=1)),
-        "innovation_oracle": at(known.mode),
+        "innovation_oracle": at(known.label),
         "strict five": at(five["strict"]), "strict two": at(two["strict"]), "two": at(two["tie_broken"]),
         "excluded": five["excluded"][:, -1].astype(int).tolist(),
         "detector alarm": first(five["alarm"]), "bank alarm": first(alarms),
@@ -277,7 +277,7 @@ def hard(first_seed: int, runs: int) -> dict[str, Any]:
     result: dict[str, Any] = {"terminated": int(flown.terminated.sum()), "faulty": float((label[scored] > 0).mean())}
     for name, (method, settings) in HARD_METHODS.items():
         known = {"scenarios": scenarios} if method == "innovation_oracle" else {}
-        right = run(make_diagnoser(method, plant, **known, **settings), flown.obs).mode == label
+        right = run(make_diagnoser(method, plant, **known, **settings), flown.obs).label == label
         result[name] = [float(right[scored & mask].mean()) for mask in (label >= 0, label > 0, label == 0)]
     alarm = run(make_diagnoser("approximation_detector", plant), flown.obs).alarm
     begin = np.array([min([f.onset for f in s.faults], default=2000) for s in scenarios])

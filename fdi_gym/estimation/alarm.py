@@ -34,8 +34,8 @@ class Evidence(NamedTuple):
     """What a detector says after a sample."""
 
     cost: Array  # (n, labels) how badly each label fits: a squared distance, or -2 log of a probability
-    theta: Array  # (n, n_estimated)
-    theta_std: Array | None = None
+    estimate: Array  # (n, n_estimated)
+    estimate_std: Array | None = None
     probs: Array | None = None  # (n, labels)
     rise: Array | None = None  # (n,) a statistic of its own that raises the alarm, in place of the costs
 
@@ -221,6 +221,6 @@ def decide(
         at = thresholds()
         s, e = detector.step(s, obs)
         declared = declare(declared, e, penalties(plant, at), at.rise, persistence)
-        return (s, declared), Diagnosis(declared.label > 0, declared.label, e.theta, e.theta_std, e.probs)
+        return (s, declared), Diagnosis(declared.label > 0, declared.label, e.estimate, e.estimate_std, e.probs)
 
     return Diagnoser(init, update)
