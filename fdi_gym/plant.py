@@ -31,6 +31,10 @@ def contiguous(a: Any) -> Array:
     return a if a.flags.writeable else a.copy()
 
 
+class NotApplicableError(ValueError):
+    """A method's word that it cannot run on a plant, with the reason (no unknown input, rank condition)."""
+
+
 class Signal(NamedTuple):
     """One entry of a vector: its name, unit and range.
 

@@ -4,7 +4,7 @@ The augmented UKF; while the innovations are too large, the step is repeated fro
 fault entries are raised, and the one that explains the measurement best is kept. `caukf`, `gaukf` and `sgaukf` are the
 satellite's own; here the increments are in units of the typical faults and the flag in those of the number of sensors.
 
-`fdi_gym.estimation.covariance_adaptation` has the searches and their sources.
+`baselines.filters.covariance_adaptation` has the searches and their sources.
 """
 
 from __future__ import annotations
@@ -13,12 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi_gym.diagnosis import Diagnoser, diagnoser
-from fdi_gym.estimation.alarm import Estimate, FaultFilter
-from fdi_gym.estimation.augmented import Augmented, augmented
-from fdi_gym.estimation.calibration import calibrated_filter
-from fdi_gym.estimation.covariance_adaptation import BETA_0, INC_JOINT, MEMORY, Search, Trial, binary_grid, element_grid
-from fdi_gym.estimation.gaussian import Gaussian, look, nis, predict, start, unscented
+from baselines.filters.augmented_gaussian import Gaussian, gaussian_filter, reading_of
+from baselines.filters.covariance_adaptation import BETA_0, INC_JOINT, MEMORY, Search, Trial, binary_grid, element_grid
+from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
+from fdi_gym.estimation.augmented import AugmentedModel, Interval, augmented
+from fdi_gym.estimation.belief import Belief
+from fdi_gym.estimation.calibration import Calibration
+from fdi_gym.estimation.decision import by_labels
+from fdi_gym.estimation.gaussian import unscented
+from fdi_gym.estimation.kalman import quadratic
 from fdi_gym.plant import Array, Plant
 
 SENSORS = 6  # of the innovations to which BETA_0 belongs
@@ -29,7 +32,9 @@ class Adaptive(NamedTuple):
     """State of the filter."""
 
     filter: Gaussian
+    before: Gaussian  # the filter before the last prediction
     beta: Array  # (n,) weighted mean of the innovation statistic
+    updates: Array  # (n,) samples with an innovation so far
     adapted: Array  # (n,) steps adapted so far
 
 
@@ -38,14 +43,14 @@ def every_subset(p: int) -> Array:
     return (np.arange(2**p)[:, None] >> np.arange(p)) % 2 == 1
 
 
-def search_of(grid: str, model: Augmented) -> Search:
-    """The search by name: "full", "simplified" (odd and even entries in turn) or "elements".
+def search_of(grid: str, model: AugmentedModel, size: Array) -> Search:
+    """The search by name: "full", "simplified" (odd and even entries in turn) or "elements"; size (p,) of typical faults.
 
     Raises:
         ValueError: Unknown name.
     """
     entries = np.arange(model.z.start, model.z.stop)
-    p, size = len(entries), model.prior.z_size
+    p = len(entries)
     inc, cap = INC_JOINT * size**2, model.limit[model.z]
     if grid == "elements":
         return element_grid(entries, inc, cap=cap)
@@ -62,66 +67,71 @@ def search_of(grid: str, model: Augmented) -> Search:
     return binary_grid(entries, inc, lambda count: turns[count % 2], cap)
 
 
-def adaptive_filter(plant: Plant, grid: str, process: str = "standard", walk: float = WALK) -> tuple[Augmented, FaultFilter]:
-    """The filter without its decision, and its model; arguments and errors as of `adaptive_ukf`."""
-    model = augmented(plant, process, walk=walk)
-    search, beta_0 = search_of(grid, model), BETA_0 / SENSORS * len(model.R)
-    r_inv = 1.0 / np.diag(model.R)
+def adaptive_filter(model: AugmentedModel, size: Array, grid: str) -> Filter:
+    """The filter without its decision; size (p,) of typical faults, grid as of `adaptive_ukf`."""
+    plain, search = gaussian_filter(model, "unscented"), search_of(grid, model, size)
+    beta_0, r_inv = BETA_0 / SENSORS * len(model.R), 1.0 / np.diag(model.R)
 
-    def step(s: Adaptive, obs: Array) -> Adaptive:
-        f = s.filter
-        at, known = model.read(f.k, obs, f.known)
-        X, P = (f.X, f.P) if f.k == 0 else predict(model, unscented, f.X, f.P, at)
-        X, P, nu, S = look(model, unscented, X, P, at)
-        after = Gaussian(f.k + 1, X, P, nu, S, known)
-        if f.k == 0:
-            return s._replace(filter=after)
-        beta = s.beta + (nis(after) - s.beta) / MEMORY
-        flag = (beta > beta_0) & (f.k > MEMORY + 1)
+    def start(n: int) -> Adaptive:
+        f = plain.start(n)
+        return Adaptive(f, f, np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64))
+
+    def predict(s: Adaptive, at: Interval) -> Adaptive:
+        return s._replace(filter=plain.predict(s.filter, at), before=s.filter)
+
+    def update(s: Adaptive, at: Interval, y: Array, seen: Array) -> Adaptive:
+        after, ours = plain.update(s.filter, at, y, seen), seen[:, model.sensors]
+        counts = ours.any(axis=1) & (at.k > 0)  # the first sample ends no interval
+        # the statistic is that of all sensors: those that are missing count with their expectation
+        nis = quadratic(after.nu, after.S) + (~ours).sum(axis=1)
+        beta = np.where(counts, s.beta + (nis - s.beta) / MEMORY, s.beta)
+        updates = s.updates + counts
+        flag = counts & (beta > beta_0) & (updates > MEMORY + 1)
         if flag.any():
             up = np.flatnonzero(flag)
 
             def run(rows: Array, P_c: Array) -> Trial:
                 i = up[rows]
-                here = at._replace(y=at.y[i], u=at.u[i], d=None if at.d is None else at.d[i])
-                X_c, P_new, *_ = look(model, unscented, *predict(model, unscented, f.X[i], P_c, here), here)
-                residual = here.y - model.h(X_c[:, None], here)[:, 0]
-                return Trial(X_c, P_new, residual**2 @ r_inv, P_c)
+                here = at.of(i)
+                X, P = model.predict(unscented, s.before.X[i], P_c, here)
+                done = model.update(unscented, X, P, here, y[i], seen[i])
+                residual = np.where(ours[i], y[i][:, model.sensors] - model.h(done.x[:, None], here)[:, 0], 0.0)
+                return Trial(done.x, done.P, residual**2 @ r_inv, P_c)
 
-            kept = search(f.P[up], s.adapted[up], run)
-            X, P = X.copy(), P.copy()
+            kept = search(s.before.P[up], s.adapted[up], run)
+            X, P = after.X.copy(), after.P.copy()
             X[up], P[up] = kept.x, kept.P
-        return Adaptive(after._replace(X=X, P=P), beta, s.adapted + flag)
+            after = after._replace(X=X, P=P)
+        return Adaptive(after, s.before, beta, updates, s.adapted + flag)
 
-    def read(s: Adaptive) -> Estimate:
-        f = s.filter
-        return Estimate(f.X[:, model.z], f.P[:, model.z, model.z], f.nu, f.S)
-
-    def first(n: int) -> Adaptive:
-        return Adaptive(start(model, n), np.zeros(n), np.zeros(n, np.int64))
-
-    return model, FaultFilter(first, step, read)
+    return Filter(start, predict, update, lambda s: reading_of(model, s.filter))
 
 
 @diagnoser("adaptive_ukf_full", "Augmented UKF, covariance adapted by binary grid search, for any plant", grid="full")
 @diagnoser("adaptive_ukf_simplified", "The same with the simplified grid", grid="simplified")
 @diagnoser("adaptive_ukf_elements", "The same, element by element", grid="elements")
 def adaptive_ukf(
-    plant: Plant, *, grid: str = "full", decision: str = "distance", process: str = "standard", walk: float = WALK
+    plant: Plant,
+    belief: Belief,
+    calibration: Calibration,
+    *,
+    grid: str = "full",
+    decision: str = "distance",
+    walk: float = WALK,
 ) -> Diagnoser:
     """The adaptive filter.
 
     Args:
         plant: Any plant whose estimated quantity enters additively and whose sensors have noise.
+        belief: What it may assume of the plant.
+        calibration: When it alarms.
         grid: "full", "simplified" or "elements".
         decision: "distance", "thresholds", "chi-square", "cusum" or "glr".
-        process: The fault process that will be met; its declaration gives walks, model errors and thresholds.
         walk: Factor on the standard deviation of the faults' random walk; small, since the search follows the jumps.
 
     Raises:
-        NotApplicableError: No sensor has noise, or the fault does not enter additively.
-        ValueError: Unknown grid, decision or process.
+        ValueError: Unknown grid or decision.
     """
-    model, filter = adaptive_filter(plant, grid, process, walk)
-    what = f"adaptive ukf {grid} {walk}"
-    return calibrated_filter(plant, filter, decision, model.prior.z_size, process=process, source=__file__, what=what)
+    model = augmented(plant, belief, walk=walk)
+    filter = adaptive_filter(model, belief.z_size, grid)
+    return diagnoser_of(plant, filter, by_labels(plant, calibration, decision, size=belief.z_size))

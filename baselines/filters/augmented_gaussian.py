@@ -1,27 +1,75 @@
-"""Augmented (joint) Kalman filters for any plant: extended, unscented and central-difference, with any decision logic.
+"""Augmented (joint) Kalman filters for any plant: extended, unscented and central-difference, with any decision.
 
 State, fault vector and unknown disturbances are one Gaussian vector; faults and disturbances are random walks. Nothing
 but the plant's declaration is needed: noises from its data sheet, walks and model errors from its fault process. On a
 linear plant the three are the Kalman filter.
 
-`fdi_gym.estimation.gaussian` has the filters and their sources, `fdi_gym.estimation.alarm` the decision logics.
+`fdi_gym.estimation.gaussian` has the rules and their sources, `fdi_gym.estimation.decision` the decisions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
-from fdi_gym.diagnosis import Diagnoser, diagnoser
-from fdi_gym.estimation.alarm import Estimate, FaultFilter
-from fdi_gym.estimation.augmented import Augmented, augmented
-from fdi_gym.estimation.calibration import calibrated_filter
-from fdi_gym.estimation.gaussian import RULES, Gaussian, advance, start
+import numpy as np
+
+from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
+from fdi_gym.estimation.augmented import AugmentedModel, Interval, augmented
+from fdi_gym.estimation.belief import Belief
+from fdi_gym.estimation.calibration import Calibration
+from fdi_gym.estimation.decision import Reading, by_labels
+from fdi_gym.estimation.gaussian import RULES
 from fdi_gym.plant import Array, Plant
 
 
-def estimate_of(model: Augmented, s: Gaussian) -> Estimate:
-    """What the filter knows of the fault vector."""
-    return Estimate(s.X[:, model.z], s.P[:, model.z, model.z], s.nu, s.S)
+class Gaussian(NamedTuple):
+    """State of the filter."""
+
+    X: Array  # (n, N)
+    P: Array  # (n, N, N)
+    nu: Array  # (n, m) last innovation
+    S: Array  # (n, m, m) its covariance
+    seen: Array  # (n,) sensors in it
+
+
+def gaussian_filter(model: AugmentedModel, rule: str, first_sample: bool = True) -> Filter:
+    """The filter of an augmented model.
+
+    Args:
+        model: The model.
+        rule: How a Gaussian passes through it, one of `fdi_gym.estimation.gaussian.RULES`.
+        first_sample: Use the first sample as a measurement; without, the filter starts from its prior alone.
+
+    Raises:
+        ValueError: Unknown rule.
+    """
+    if rule not in RULES:
+        raise ValueError(f"unknown rule {rule!r}; there are {', '.join(RULES)}")
+    passes = RULES[rule]
+
+    def start(n: int) -> Gaussian:
+        m = len(model.R)
+        return Gaussian(
+            np.tile(model.X0, (n, 1)), np.tile(model.P0, (n, 1, 1)), np.zeros((n, m)), np.tile(model.R, (n, 1, 1)),
+            np.zeros(n, np.int64),
+        )  # fmt: skip
+
+    def predict(s: Gaussian, at: Interval) -> Gaussian:
+        X, P = model.predict(passes, s.X, s.P, at)
+        return s._replace(X=X, P=P)
+
+    def update(s: Gaussian, at: Interval, y: Array, seen: Array) -> Gaussian:
+        c = model.update(passes, s.X, s.P, at, y, seen)
+        return Gaussian(c.x, c.P, c.nu, c.S, seen[:, model.sensors].sum(axis=1))
+
+    return Filter(start, predict, update, lambda s: reading_of(model, s), first_sample)
+
+
+def reading_of(model: AugmentedModel, s: Gaussian) -> Reading:
+    """What an augmented filter knows."""
+    x, z = model.x, model.z
+    return Reading(s.X[:, z], s.P[:, z, z], s.X[:, x], s.P[:, x, x], s.nu, s.S, s.seen)
 
 
 @diagnoser("augmented_ekf", "Augmented extended Kalman filter, for any plant")
@@ -34,10 +82,11 @@ def estimate_of(model: Augmented, s: Gaussian) -> Estimate:
 @diagnoser("augmented_ekf_glr", "The augmented EKF, alarms by a GLR test of its innovations", decision="glr")
 def augmented_ekf(
     plant: Plant,
+    belief: Belief,
+    calibration: Calibration,
     *,
     rule: str = "extended",
     decision: str = "distance",
-    process: str = "standard",
     walk: float = 1.0,
     x0_std: Sequence[float] | None = None,
     z0_std: Sequence[float] | None = None,
@@ -48,23 +97,16 @@ def augmented_ekf(
 
     Args:
         plant: Any plant whose estimated quantity enters additively and whose sensors have noise.
+        belief: What it may assume of the plant.
+        calibration: When it alarms.
         rule: How a Gaussian passes through the model: "extended", "unscented" or "central difference".
         decision: "distance", "thresholds", "chi-square", "cusum" or "glr".
-        process: The fault process that will be met; its declaration gives walks, model errors and thresholds.
         walk, x0_std, z0_std, z_walk: As in `fdi_gym.estimation.augmented.augmented`.
         first_sample: Use the first sample as a measurement; without, the filter starts from its prior alone.
 
     Raises:
-        NotApplicableError: No sensor has noise, or the fault does not enter additively.
-        ValueError: Unknown rule, decision or process.
+        ValueError: Unknown rule or decision.
     """
-    if rule not in RULES:
-        raise ValueError(f"unknown rule {rule!r}; there are {', '.join(RULES)}")
-    model = augmented(plant, process, walk=walk, x0_std=x0_std, z0_std=z0_std, z_walk=z_walk)
-
-    def step(s: Gaussian, obs: Array) -> Gaussian:
-        return advance(model, RULES[rule], s, obs, first_sample)
-
-    what = f"augmented {rule} {walk} {x0_std} {z0_std} {z_walk} {first_sample}"
-    filter = FaultFilter(lambda n: start(model, n), step, lambda s: estimate_of(model, s))
-    return calibrated_filter(plant, filter, decision, model.prior.z_size, process=process, source=__file__, what=what)
+    model = augmented(plant, belief, walk=walk, x0_std=x0_std, z0_std=z0_std, z_walk=z_walk)
+    rules = by_labels(plant, calibration, decision, size=belief.z_size)
+    return diagnoser_of(plant, gaussian_filter(model, rule, first_sample), rules)

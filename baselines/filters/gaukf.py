@@ -12,7 +12,7 @@ import numpy as np
 
 from baselines.filters.dual_ukf import filter_of
 from fdi_gym.diagnosis import Diagnoser, diagnoser
-from fdi_gym.estimation.covariance_adaptation import BETA_0, INC_DUAL, INC_JOINT, binary_grid
+from baselines.filters.covariance_adaptation import BETA_0, INC_DUAL, INC_JOINT, binary_grid
 from fdi_gym.estimation.effectiveness import Q_THETA, THRESHOLD
 from fdi_gym.plant import Array, Plant
 

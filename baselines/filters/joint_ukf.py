@@ -16,7 +16,7 @@ import numpy as np
 
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
 from fdi_gym.estimation.attitude import require_attitude, with_scalar
-from fdi_gym.estimation.covariance_adaptation import BETA_0, EPS_R, MEMORY, Search, Trial, adapt
+from baselines.filters.covariance_adaptation import BETA_0, EPS_R, MEMORY, Search, Trial, adapt
 from fdi_gym.estimation.effectiveness import F_MAX, F_MIN, P_THETA, Q_THETA, THRESHOLD, threshold_rule
 from fdi_gym.estimation.kalman import T, symmetric, times
 from fdi_gym.estimation.unscented import covariance, mean_and_deviations, sigma_points, weights

@@ -1,43 +1,146 @@
-"""Interacting multiple models for any plant: one extended Kalman filter per label, with the modes' own lines.
+"""Interacting multiple models for any plant: one extended Kalman filter per label, with the magnitudes of its own faults.
 
-`fdi_gym.estimation.multiple_model` has the algebra and its source. The probabilities are the bank's; the label is the one
-whose probability beats the calibrated thresholds.
+Model j has the fault vector on the line of label j: theta = healthy + offset_j + D_j m, and the state [x; m; d]. The
+label is a Markov chain; between samples the models exchange state and disturbance in proportion to the probability that
+the label has just changed, and a model that was not in force has the magnitude's prior back. The likelihoods of the
+innovations give the probabilities of the labels; the label is the one whose probability beats the calibrated thresholds.
+
+H. A. P. Blom, Y. Bar-Shalom, IEEE Transactions on Automatic Control 33(8), 1988.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from fdi_gym.diagnosis import Diagnoser, diagnoser
-from fdi_gym.estimation.alarm import Detector, Evidence
-from fdi_gym.estimation.calibration import calibrated
-from fdi_gym.estimation.multiple_model import Models, advance, bank, deviation, start
+from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
+from fdi_gym.estimation import mixing
+from fdi_gym.estimation.augmented import AugmentedModel, Interval, augmented
+from fdi_gym.estimation.belief import Belief
+from fdi_gym.estimation.calibration import Calibration
+from fdi_gym.estimation.decision import Reading, by_labels
+from fdi_gym.estimation.gaussian import extended
+from fdi_gym.estimation.kalman import log_likelihood
 from fdi_gym.plant import Array, Plant
+
+SMALLEST_MAGNITUDE, SLOWEST_WALK = 0.05, 1e-3  # standard deviations, in units of the mode's root mean square
+LEAST = 1e-12  # probability of a label
+
+
+class Hypotheses(NamedTuple):
+    """The models of all labels, stacked."""
+
+    model: AugmentedModel  # of [x; m; d]; row j of a stack lies on the line of label j
+    m0: Array  # (labels, f) prior magnitude of each label's faults; 0 where it has fewer
+    M0: Array  # (labels, f, f) its covariance
+    transition: Array  # (labels, labels) from row to column
+
+
+def hypotheses(plant: Plant, belief: Belief) -> Hypotheses:
+    """The models of a plant, from what is believed of it.
+
+    Raises:
+        NotApplicableError: The fault vector does not enter additively.
+    """
+    base, p = augmented(plant, belief), belief
+    labels, n_x = len(plant.labels), len(plant.states)
+    width = max(1, *(len(label.modes) for label in plant.labels))
+    number = {mode.name: i for i, mode in enumerate(plant.modes)}
+    typical = np.sqrt(p.m_mean**2 + p.m_std**2)
+    offset, direction = np.zeros((labels, len(p.z_size))), np.zeros((labels, len(p.z_size), width))
+    m0, M0, walk = np.zeros((labels, width)), np.zeros((labels, width, width)), np.zeros((labels, width))
+    for j, label in enumerate(plant.labels):
+        for f, i in enumerate(sorted(number[name] for name in label.modes)):
+            mode = plant.modes[i]
+            offset[j] += mode.offset
+            direction[j, :, f] = mode.direction
+            m0[j, f], walk[j, f] = p.m_mean[i], max(p.m_walk[i], SLOWEST_WALK * typical[i]) ** 2
+            M0[j, f, f] = max(p.m_std[i], SMALLEST_MAGNITUDE * typical[i]) ** 2
+    N = n_x + width + len(p.disturbances)
+    z, d = slice(n_x, n_x + width), slice(n_x + width, N)
+    rest = base.rest
+    keep = [*range(n_x), *range(d.start, N)]
+    Q = np.zeros((labels, N, N))
+    Q[np.ix_(range(labels), keep, keep)] = base.Q[np.ix_(rest, rest)]
+    Q[:, range(z.start, z.stop), range(z.start, z.stop)] = walk
+    P0 = np.zeros((N, N))
+    P0[np.ix_(keep, keep)] = base.P0[np.ix_(rest, rest)]
+    X0, scale = np.zeros(N), np.ones(N)
+    X0[keep], scale[keep] = base.X0[rest], base.scale[rest]
+    scale[z] = max(float(typical.max()), 1e-12)
+    limit = np.full(N, np.inf)
+    change = p.changes / (labels - 1)
+    H = None
+    if base.H is not None and not base.H[:, base.z].any():
+        H = np.zeros((len(base.R), N))
+        H[:, keep] = base.H[:, rest]
+    model = base._replace(z=z, d=d, scale=scale, X0=X0, P0=P0, Q=Q, limit=limit, H=H, lines=(offset, direction))
+    return Hypotheses(model, m0, M0, np.full((labels, labels), change) + (1 - change * labels) * np.eye(labels))
+
+
+class Models(NamedTuple):
+    """State of the bank."""
+
+    X: Array  # (n, labels, N)
+    P: Array  # (n, labels, N, N)
+    mu: Array  # (n, labels) probabilities of the labels
+    c: Array  # (n, labels) predicted ones
+
+
+def bank(b: Hypotheses) -> Filter:
+    """The filter of all models."""
+    model, labels = b.model, len(b.m0)
+    N, z, x = len(model.scale), model.z, model.x
+    assert model.lines is not None
+    offset, direction = model.lines
+
+    def start(n: int) -> Models:
+        X, P = np.tile(model.X0, (n, labels, 1)), np.tile(model.P0, (n, labels, 1, 1))
+        X[..., z], P[..., z, z] = b.m0, b.M0
+        mu = np.full((n, labels), LEAST)
+        mu[:, 0] = 1.0
+        return Models(X, P, mu, mu)
+
+    def each(n: int) -> Array:
+        return np.repeat(np.arange(n), labels)
+
+    def predict(s: Models, at: Interval) -> Models:
+        n = len(s.mu)
+        c, w = mixing.ahead(s.mu, b.transition)
+        X, P = mixing.mix(w, s.X, s.P, z, b.m0, b.M0)
+        X, P = model.predict(
+            extended, X.reshape(-1, N), P.reshape(-1, N, N), at.of(each(n)), np.tile(model.Q, (n, 1, 1))
+        )
+        return Models(X.reshape(n, labels, N), P.reshape(n, labels, N, N), s.mu, c)
+
+    def update(s: Models, at: Interval, y: Array, seen: Array) -> Models:
+        n = len(s.mu)
+        rows = each(n)
+        done = model.update(extended, s.X.reshape(-1, N), s.P.reshape(-1, N, N), at.of(rows), y[rows], seen[rows])
+        mu = mixing.weigh(s.c, log_likelihood(done.nu, done.S).reshape(n, labels), LEAST)
+        return Models(done.x.reshape(n, labels, N), done.P.reshape(n, labels, N, N), mu, mu)
+
+    def read(s: Models) -> Reading:
+        deviation = offset + (direction @ s.X[..., z, None])[..., 0]  # (n, labels, p)
+        mu = s.mu / s.mu.sum(axis=1, keepdims=True)
+        mean = (mu[..., None] * deviation).sum(axis=1)
+        D = deviation - mean[:, None]
+        within = direction @ s.P[..., z, z] @ np.swapaxes(direction, -1, -2)
+        P = (mu[..., None, None] * (within + D[..., :, None] * D[..., None, :])).sum(axis=1)
+        state = (mu[..., None] * s.X[..., x]).sum(axis=1)
+        return Reading(mean, P, state, cost=-2.0 * np.log(s.mu), probs=mu)
+
+    return Filter(start, predict, update, read)
 
 
 @diagnoser("multiple_model_ekf", "Interacting multiple models, one extended Kalman filter per label, for any plant")
-def multiple_model_ekf(plant: Plant, *, process: str = "standard") -> Diagnoser:
+def multiple_model_ekf(plant: Plant, belief: Belief, calibration: Calibration) -> Diagnoser:
     """The bank with its decision.
 
     Args:
         plant: Any plant whose estimated quantity enters additively and whose sensors have noise.
-        process: The fault process that will be met; its declaration gives the magnitudes, how often labels change, model
-            errors and thresholds.
-
-    Raises:
-        NotApplicableError: No sensor has noise, or the fault does not enter additively.
-        ValueError: Unknown process.
+        belief: The magnitudes of its faults, how often labels change, model errors.
+        calibration: When it alarms.
     """
-    models = bank(plant, process)
-    healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
-
-    def step(s: Models, obs: Array) -> tuple[Models, Evidence]:
-        s = advance(models, s, obs)
-        z = deviation(models, s)
-        mean = (s.mu[..., None] * z).sum(axis=1)
-        variance = (s.mu[..., None] * (z - mean[:, None]) ** 2).sum(axis=1)
-        return s, Evidence(-2.0 * np.log(s.mu), healthy + mean, np.sqrt(variance), s.mu)
-
-    return calibrated(
-        plant, Detector(lambda n: start(models, n), step), process=process, source=__file__, what="multiple model ekf"
-    )
+    return diagnoser_of(plant, bank(hypotheses(plant, belief)), by_labels(plant, calibration))

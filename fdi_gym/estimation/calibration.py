@@ -1,183 +1,104 @@
-"""Calibration on healthy flights: one rate of false alarms for every method, whatever its statistic.
+"""Calibrations: plain data that says at what evidence a method alarms; and how they are found from recorded evidence.
 
-Flights of the fault process that will be met are flown without their faults, with validation seeds, and shown to the
-method. What it takes to keep quiet on all but a small share of them is its threshold. The truth may lie off the model
-there as it will in the test, so a method that is too sure of itself is given the thresholds that this costs.
+One rate of false alarms for every method, whatever its statistic: what it takes to keep quiet on all but a small share of
+healthy flights is its threshold. The truth may lie off the model there as it will in the test, so a method that is too
+sure of itself is given the thresholds that this costs. `fdi_gym.diagnosis.fit` flies those flights.
 """
 
 from __future__ import annotations
 
-import functools
-import hashlib
-import importlib
-import json
-import os
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping
 
 import msgspec
 import numpy as np
 
-from fdi_gym.diagnosis import Diagnoser
-from fdi_gym.estimation.alarm import (
-    LEAST,
-    PERSISTENCE,
-    Detector,
-    FaultFilter,
-    Persistence,
-    Thresholds,
-    decide,
-    gain,
-    penalties,
-    watch,
-)
-from fdi_gym.estimation.prior import flights_of
-from fdi_gym.kernels import cache_folder
-from fdi_gym.plant import Array, Plant, plant_sources
-from fdi_gym.simulation import Record
+from fdi_gym.plant import Array, Plant
 
+LEAST = 3.84  # a threshold is never below the 95 % point of one degree of freedom
 RATE = 0.05  # share of the healthy flights with a false alarm
-FIRST = 100_000  # calibration flights begin at VALIDATION_SEED + FIRST
-SAMPLES = 100_000  # about so many samples are flown, in 20 to 60 flights
 
 
-def _healthy_flights(plant: Plant, process: str) -> Record:
-    steps = flights_of(plant, process, FIRST, 1, False)[0][0].steps
-    return flights_of(plant, process, FIRST, int(np.clip(SAMPLES // steps, 20, 60)), False)[1]
+class Persistence(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Consecutive samples until an alarm is raised, its label changes, and it is given up.
+
+    `warmup` samples at first neither decide nor count. With `same` the samples must agree on the label too.
+    """
+
+    rise: int = 3
+    switch: int = 5
+    release: int = 10
+    warmup: int = -1
+    same: bool = False
 
 
-def excess_covariance(plant: Plant, process: str, filter: FaultFilter) -> Array:
-    """By how much the spread of a healthy estimate exceeds the filter's own covariance (p, p); zero if it does not."""
-    record = _healthy_flights(plant, process)
-    n, samples, _ = record.obs.shape
-    s, own, found, count = filter.start(n), 0.0, 0.0, 0
-    for k in range(samples):
-        s = filter.step(s, record.obs[:, k])
-        e = filter.read(s)
-        flown = (k <= record.length) & np.isfinite(e.z).all(axis=1)
-        z = e.z[flown]
-        own, found, count = own + e.P[flown].sum(axis=0), found + z.T @ z, count + len(z)
-    values, vectors = np.linalg.eigh((found - own) / max(count, 1))
-    return (vectors * np.maximum(values, 0.0)) @ vectors.T
+class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """When a method alarms.
+
+    Args:
+        thresholds: By how much a fault of each mode must fit better than health, by its name. An alarm is given up where
+            the best label has less than half of its threshold left.
+        rise: Threshold of a statistic that raises the alarm in place of these; None raises none.
+        excess: By how much the covariance of a healthy estimate is too small (p, p).
+        channels: Thresholds of the smoothed entries of the fault vector, by name.
+        persistence: Samples in a row.
+    """
+
+    thresholds: Mapping[str, float] = {}
+    rise: float | None = None
+    excess: np.ndarray | None = None
+    channels: Mapping[str, float] = {}
+    persistence: Persistence = Persistence()
+
+    def penalties(self, plant: Plant) -> Array:
+        """What each label must gain (labels,): the thresholds of its modes; without bound where there is none.
+
+        Raises:
+            ValueError: Thresholds of modes that the plant does not have.
+        """
+        names = {mode.name for mode in plant.modes}
+        if unknown := sorted(set(self.thresholds) - names):
+            raise ValueError(f"a calibration of another plant: {plant.id} has no modes {unknown}")
+        return np.array([sum(self.thresholds.get(name, np.inf) for name in label.modes) for label in plant.labels])
 
 
-def held(values: Array, after: int) -> Array:
+def uniform(plant: Plant, threshold: float, persistence: Persistence) -> Calibration:
+    """One threshold for every mode: that of a paper."""
+    return Calibration(thresholds={mode.name: threshold for mode in plant.modes}, persistence=persistence)
+
+
+def gain(cost: Array, penalty: Array) -> Array:
+    """The gain in fit over healthy of the best faulty label, as a share of what it must be (..., from (..., labels))."""
+    with np.errstate(invalid="ignore"):  # an infinite cost, of a label that cannot be
+        return ((cost[..., :1] - cost[..., 1:]) / penalty[1:]).max(axis=-1)
+
+
+def sustained(values: Array, after: int) -> Array:
     """The largest level that a statistic (N, K) stays above for `after` consecutive samples, per flight (N,)."""
     lowest = np.lib.stride_tricks.sliding_window_view(values, after, axis=1).min(axis=2)
     return lowest.max(axis=1)
 
 
-def thresholds_of(
-    plant: Plant, process: str, detector: Detector, persistence: Persistence = PERSISTENCE, rate: float = RATE
-) -> Thresholds:
-    """The thresholds that a share `rate` of the healthy flights of a process reaches, to four digits.
+def _reached(statistic: Array, after: int, least: float) -> float:
+    return max(float(np.quantile(sustained(statistic, after), 1 - RATE, method="higher")), least)
 
-    Each mode's is what it reaches alone; one factor on them all brings the share of flights with any alarm to `rate`.
+
+def thresholds_from(plant: Plant, cost: Array, rise: Array | None, persistence: Persistence) -> tuple[dict[str, float], float | None]:
+    """Thresholds that a share RATE of healthy flights reaches, to four digits: of the modes, and of the rising statistic.
+
+    Each mode's is what it reaches alone; one factor on them all brings the share of flights with any alarm to RATE.
+
+    Args:
+        plant: The plant.
+        cost: (N, K, labels) of healthy flights.
+        rise: (N, K), or None.
+        persistence: Samples in a row that raise the alarm.
     """
-    record = _healthy_flights(plant, process)
-    n, samples, _ = record.obs.shape
-    cost, rise = np.zeros((n, samples, len(plant.labels))), None
-    s = detector.start(n)
-    for k in range(samples):
-        s, e = detector.step(s, record.obs[:, k])
-        flown = (k <= record.length) & np.isfinite(e.cost).all(axis=1)
-        cost[:, k] = np.where(flown[:, None], e.cost, cost[:, max(k - 1, 0)])
-        if e.rise is not None:
-            rise = np.full((n, samples), -np.inf) if rise is None else rise
-            rise[:, k] = np.where(flown, e.rise, -np.inf)
-
-    def reached(statistic: Array, least: float) -> float:
-        return max(float(np.quantile(held(statistic, persistence.rise), 1 - rate, method="higher")), least)
-
     alone = {next(iter(label.modes)): i for i, label in enumerate(plant.labels) if len(label.modes) == 1}
-    modes = [
-        reached(cost[..., 0] - cost[..., alone[m.name]], LEAST) if m.name in alone else LEAST for m in plant.modes
-    ]  # fmt: skip
-    share = reached(gain(cost, penalties(plant, Thresholds(tuple(modes)))), 0.5)
-    return Thresholds(
-        tuple(float(f"{share * level:.4g}") for level in modes),
-        None if rise is None else float(f"{reached(rise, 1e-3):.4g}"),
-    )
-
-
-_kept: dict[str, Any] = {}
-
-
-def _source_of(plant: Plant) -> str:
-    """Digest of the file that declares the plant; nothing for one that was never registered."""
-    source = plant_sources().get(plant.id)
-    file = importlib.import_module(source.builder.split(":")[0]).__file__ if source else None
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:16] if file else ""
-
-
-def once(plant: Plant, process: str, source: str, what: str, compute: Callable[[], Any]) -> Any:
-    """The result of a calibration: kept in memory and on disk, where an edit of any source that it came from shows.
-
-    Args:
-        plant, process: What it was calibrated on.
-        source: The method's file.
-        what: Everything else that it depends on: the method's name and tuning.
-        compute: Gives the result, JSON data.
-    """
-    key = json.dumps([plant.env_id, _source_of(plant), dict(plant.options), process, source, what], sort_keys=True)
-    if key not in _kept:
-        folder = cache_folder(source)
-        path = folder / f"calibration-{hashlib.sha256(key.encode()).hexdigest()[:24]}.json" if folder else None
-        if path is not None and path.is_file():
-            _kept[key] = json.loads(path.read_bytes())
-        else:
-            _kept[key] = compute()
-            if path is not None:
-                part = path.with_name(f"{path.name}.{os.getpid()}.part")
-                part.write_bytes(msgspec.json.encode(_kept[key]))
-                part.replace(path)
-    return _kept[key]
-
-
-def calibrated(plant: Plant, detector: Detector, *, process: str, source: str, what: str) -> Diagnoser:
-    """The diagnoser of a detector at its calibrated thresholds; the calibration is flown when it is first used.
-
-    Args:
-        plant: The plant.
-        detector: The detector.
-        process: The fault process that will be met.
-        source: The method's file.
-        what: Its name and tuning.
-
-    Raises:
-        ValueError: Unknown process.
-    """
-    plant.process(process)
-
-    @functools.cache
-    def thresholds() -> Thresholds:
-        found = once(plant, process, source, what, lambda: thresholds_of(plant, process, detector)._asdict())
-        return Thresholds(tuple(found["modes"]), found["rise"])
-
-    return decide(plant, detector, thresholds)
-
-
-def calibrated_filter(
-    plant: Plant, filter: FaultFilter, decision: str, size: Array, *, process: str, source: str, what: str
-) -> Diagnoser:
-    """The diagnoser of a filter of the fault vector, with a decision logic at its calibrated thresholds.
-
-    Args:
-        plant: The plant.
-        filter: The filter.
-        decision, size: As in `fdi_gym.estimation.alarm.watch`.
-        process, source, what: As in `calibrated`.
-
-    Raises:
-        ValueError: Unknown process or decision.
-    """
-    p = len(plant.estimated)
-
-    @functools.cache
-    def excess() -> Array:
-        found = once(plant, process, source, f"{what}: excess", lambda: excess_covariance(plant, process, filter).tolist())
-        return np.array(found).reshape(p, p)
-
-    detector = watch(plant, filter, decision, size, excess)
-    return calibrated(plant, detector, process=process, source=source, what=f"{what} {decision}")
+    after = persistence.rise
+    levels = {
+        m.name: _reached(cost[..., 0] - cost[..., alone[m.name]], after, LEAST) if m.name in alone else LEAST
+        for m in plant.modes
+    }
+    share = _reached(gain(cost, Calibration(thresholds=levels).penalties(plant)), after, 0.5)
+    found = {name: float(f"{share * level:.4g}") for name, level in levels.items()}
+    return found, None if rise is None else float(f"{_reached(rise, after, 1e-3):.4g}")

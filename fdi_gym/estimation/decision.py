@@ -1,8 +1,18 @@
-"""Decision logic: from an estimate of the fault parameter and its covariance to an alarm and a label.
+"""From what a filter reads after a sample to an alarm and a label: one automaton, and the evidence that feeds it.
 
-Each logic is a part that any parameter-estimating filter can use: `start(n)` gives its state for n episodes, and
-`step(state, k, z, P)` takes the estimate's deviation from healthy z (n, p) and covariance P (n, p, p) at sample k and
-returns (state, Decision).
+A rule is a pair of functions, `start(n)` and `step(state, k, reading, informed) -> (state, Verdict)`. The rules here:
+
+- `by_labels`: how badly each label fits, as a distance of the estimate or in the method's own words, against the
+  thresholds of a calibration. The alarm may be raised by a statistic of the innovations instead:
+  "chi-square": weighted mean of the normalised innovation squared (R. K. Mehra, J. Peschon, Automatica 7, 1971);
+  "cusum": Page's cumulative sum of it (E. S. Page, Biometrika 41, 1954);
+  "glr": generalised likelihood ratio of a jump in the mean of the whitened innovations at an unknown time within a
+  window (M. Basseville, I. V. Nikiforov, Detection of Abrupt Changes, 1993).
+  A filter that follows the fault soon explains its innovations again; they raise the alarm, the distance keeps it.
+- `by_candidate`: a label for every sample, which must persist;
+- `by_channels`: each entry of the fault vector smoothed and compared with a threshold; the set is the label.
+
+A sample at which no sensor reported says nothing, and no counter moves.
 """
 
 from __future__ import annotations
@@ -12,269 +22,287 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi_gym.diagnosis import Diagnoser, Diagnosis
-from fdi_gym.plant import Array, FaultMode, Plant, contiguous
+from fdi_gym.estimation.belief import FaultInputs
+from fdi_gym.estimation.calibration import LEAST, Calibration, Persistence, gain
+from fdi_gym.estimation.kalman import quadratic
+from fdi_gym.estimation.labels import channel_sets, distances, label_of_channels, manifolds
+from fdi_gym.plant import Array, Plant
 
 
-class Decision(NamedTuple):
-    """What a logic says after a sample."""
+class Reading(NamedTuple):
+    """What a filter says after a sample. What it does not have is None."""
+
+    z: Array | None = None  # (n, p) the estimate's deviation from healthy
+    P: Array | None = None  # (n, p, p) its covariance
+    x: Array | None = None  # (n, n_x) the plant's state
+    Px: Array | None = None  # (n, n_x, n_x) its covariance
+    nu: Array | None = None  # (n, m) innovation, 0 where a sensor did not report
+    S: Array | None = None  # (n, m, m) its covariance, as of `kalman.masked`
+    seen: Array | None = None  # (n,) sensors that reported
+    cost: Array | None = None  # (n, labels) how badly each label fits, in the method's own words: -2 log of a likelihood
+    probs: Array | None = None  # (n, labels)
+    signals: dict[str, Array] | None = None  # (n, ...) each
+
+
+class Evidence(NamedTuple):
+    """What a rule weighed: what thresholds are found from."""
+
+    cost: Array | None = None  # (n, labels)
+    rise: Array | None = None  # (n,) the statistic that raises the alarm in place of the costs
+    channels: Array | None = None  # (n, p) smoothed magnitudes
+
+
+class Verdict(NamedTuple):
+    """What a rule says after a sample."""
 
     alarm: Array  # (n,) bool
     label: Array  # (n,) int
-    structured: Array  # (n, p) the deviation that the label's own line explains best; 0 without alarm
+    z: Array | None = None  # (n, p) the deviation that is reported in place of the reading's
+    evidence: Evidence = Evidence()
 
 
-class Logic(NamedTuple):
+class Rule(NamedTuple):
     """A pair of functions; see the module's docstring."""
 
     start: Callable[[int], Any]
-    step: Callable[[Any, int, Array, Array], tuple[Any, Decision]]
+    step: Callable[[Any, Array, Reading, Array], tuple[Any, Verdict]]  # (state, k (n,), reading, informed (n,) bool)
 
 
-class Manifolds(NamedTuple):
-    """The sets that labels of f simultaneous faults span in the estimated space: offset + directions m, low <= m <= high."""
-
-    labels: Array  # (h,) label indices
-    offset: Array  # (h, p)
-    direction: Array  # (h, p, f)
-    low: Array  # (h, f)
-    high: Array  # (h, f)
+# ---------------------------------------------------------------------------------------------------------------
+# The automaton
 
 
-def manifolds(plant: Plant) -> list[Manifolds]:
-    """The faulty labels of a plant as sets, from the lines of their modes, grouped by the number of faults."""
-    modes = {mode.name: mode for mode in plant.modes}
-    groups: dict[int, list[tuple[int, list[FaultMode]]]] = {}
-    for index, label in enumerate(plant.labels):
-        if label.modes:
-            groups.setdefault(len(label.modes), []).append((index, [modes[name] for name in sorted(label.modes)]))
-    return [
-        Manifolds(
-            np.array([index for index, _ in group]),
-            np.array([np.sum([line.offset for line in lines], axis=0) for _, lines in group]),
-            np.array([np.transpose([line.direction for line in lines]) for _, lines in group]),
-            np.array([[line.reach[0] for line in lines] for _, lines in group]),
-            np.array([[line.reach[1] for line in lines] for _, lines in group]),
-        )
-        for _, group in sorted(groups.items())
-    ]
+class Declared(NamedTuple):
+    """The declared value, and for how many samples each condition has held; all of one shape."""
+
+    label: Array
+    over: Array
+    other: Array
+    under: Array
+    best: Array  # of the last sample
 
 
-def nearest_of(I: Array, Iz: Array, sets: Manifolds) -> tuple[Array, Array]:  # noqa: E741
-    """min over m in its box of q' I q - 2 q' Iz with q = offset + D m, the log likelihood ratio of a set, times -2.
+def undeclared(shape: int | tuple[int, ...]) -> Declared:
+    """Nothing is declared."""
+    return Declared(*(np.zeros(shape, np.int64) for _ in Declared._fields))
 
-    I (n or 1, p, p) information about the deviation from healthy, Iz (n, p) what it says. Returns (n, h) and m (n, h, f).
+
+def declare(s: Declared, best: Array, over: Array, under: Array, after: Persistence, informed: Array) -> Declared:
+    """The declared value after a sample.
+
+    Args:
+        s: Before it.
+        best: The value that fits best.
+        over: The evidence is enough to raise an alarm.
+        under: It is little enough to give one up.
+        after: How many samples in a row that takes. A release wins over a switch.
+        informed: Where the sample says anything; elsewhere nothing changes.
     """
-    from fdi_gym import kernels
-
-    D, offset = sets.direction, sets.offset
-    Io = (I @ offset.T).swapaxes(1, 2)  # (n, h, p)
-    base = (Io * offset).sum(axis=2) - 2 * Iz @ offset.T
-    g = ((Iz[:, None, :] - Io)[:, :, None, :] @ D)[:, :, 0, :]  # (n, h, f)
-    G = np.swapaxes(D, 1, 2) @ I[:, None] @ D  # (n, h, f, f)
-    G = G if len(G) == len(g) else np.repeat(G, len(g), axis=0)  # the kernel does not repeat the only row of I
-    m, value = np.zeros_like(g), np.empty_like(base)
-    kernels.box_minimum(*(contiguous(a) for a in (G, g, sets.low, sets.high)), m, value)
-    return base + value, m
-
-
-def closest(z: Array, I: Array, sets: Manifolds) -> tuple[Array, Array]:  # noqa: E741
-    """Distance of each estimate to each set: min over m in its box of (z - offset - D m)' I (z - offset - D m).
-
-    z (n, p), I = P^-1 (n, p, p). Returns (J (n, h), m (n, h, f)).
-    """
-    Iz = (I @ z[..., None])[..., 0]
-    value, m = nearest_of(I, Iz, sets)
-    return (Iz * z).sum(axis=1)[:, None] + value, m
-
-
-class Fits(NamedTuple):
-    """The faulty labels ranked by distance, over all groups."""
-
-    labels: Array  # (h,)
-    J: Array  # (n, h)
-    J_healthy: Array  # (n,)
-    deviation: Array  # (n, h, p) the closest point of each label's set
-
-
-def fit(z: Array, P: Array, groups: list[Manifolds]) -> Fits:
-    """Distances of the estimate to healthy and to every faulty label, in the metric of its covariance."""
-    I = np.linalg.inv(P)  # noqa: E741 (the metric itself is needed: it weighs many residuals)
-    parts = [closest(z, I, sets) for sets in groups]
-    points = [sets.offset + (sets.direction @ m[..., None])[..., 0] for sets, (_, m) in zip(groups, parts, strict=True)]
-    return Fits(
-        np.concatenate([sets.labels for sets in groups]),
-        np.concatenate([J for J, _ in parts], axis=1),
-        (z[:, None, :] @ I @ z[:, :, None])[:, 0, 0],
-        np.concatenate(points, axis=1),
+    on = s.label > 0
+    before = np.where(after.same & (best != s.best), 0, 1)
+    n_over = np.where(over & ~on, before * s.over + 1, 0)
+    n_other = np.where((best != s.label) & on, before * s.other + 1, 0)
+    n_under = np.where(under & on, s.under + 1, 0)
+    raised, switched, released = n_over >= after.rise, n_other >= after.switch, n_under >= after.release
+    found = Declared(
+        np.where(released, 0, np.where(raised | switched, best, s.label)),
+        np.where(raised, 0, n_over),
+        np.where(switched | released, 0, n_other),
+        np.where(released, 0, n_under),
+        best,
     )
+    if informed.all():
+        return found
+    return Declared(*(np.where(informed, new, old) for new, old in zip(found, s, strict=True)))
 
 
-def _count(condition: Array, counter: Array) -> Array:
-    """Consecutive samples on which the condition has held."""
-    return np.where(condition, counter + 1, 0)
+# ---------------------------------------------------------------------------------------------------------------
+# Statistics of the innovations
 
 
-def _structured(fits: Fits, label: Array) -> Array:
-    """The closest point of the declared label's set; healthy where none is declared."""
-    mine = fits.labels == label[:, None]
-    return (fits.deviation * mine[..., None]).sum(axis=1)
+class Statistic(NamedTuple):
+    """start(n, m) and step(state, reading, informed) -> (state, statistic (n,))."""
+
+    start: Callable[[int, int], Any]
+    step: Callable[[Any, Reading, Array], tuple[Any, Array]]
 
 
-def distance_logic(
-    plant: Plant,
-    *,
-    threshold: float = 8.0,
-    alarm_after: int = 5,
-    switch_after: int = 10,
-    release_after: int = 50,
-    warmup: int = 150,
-) -> Logic:
-    """Mahalanobis distance of the estimate to the faulty labels' sets against its distance to healthy.
-
-    G = J_0 - min J_h is the gain in fit of the best faulty label. Alarm at the `alarm_after`-th consecutive sample with
-    G > threshold; in alarm, the label follows the best one after it differed for `switch_after` samples, and is
-    released after `release_after` samples with G < threshold / 2 (a release wins over a switch). Silent and not
-    counting for the first `warmup` samples.
-    """
-    groups, p = manifolds(plant), len(plant.estimated)
-
-    def start(n: int) -> tuple[Array, ...]:
-        return tuple(np.zeros(n, np.int64) for _ in range(4))
-
-    def step(state: tuple[Array, ...], k: int, z: Array, P: Array) -> tuple[tuple[Array, ...], Decision]:
-        label, over, other, under = state
-        n = len(z)
-        if k <= warmup:
-            return state, Decision(np.zeros(n, bool), label, np.zeros((n, p)))
-        fits = fit(z, P, groups)
-        nearest = np.argmin(fits.J, axis=1)
-        gain, best = fits.J_healthy - fits.J[np.arange(n), nearest], fits.labels[nearest]
-        on = label > 0
-        over = _count((gain > threshold) & ~on, over)
-        other = _count((best != label) & on, other)
-        under = _count((gain < threshold / 2) & on, under)
-        raised, switched, released = over == alarm_after, other == switch_after, under == release_after
-        label = np.where(released, 0, np.where(raised | switched, best, label))
-        over, under = np.where(raised, 0, over), np.where(released, 0, under)
-        other = np.where(switched | released, 0, other)
-        return (label, over, other, under), Decision(label > 0, label, _structured(fits, label))
-
-    return Logic(start, step)
+def _excess(r: Reading) -> Array:
+    """nu' S^-1 nu less its expectation, the number of sensors that reported (n,)."""
+    assert r.nu is not None
+    assert r.S is not None
+    assert r.seen is not None
+    return quadratic(r.nu, r.S) - r.seen
 
 
-def penalty_logic(plant: Plant, *, penalty: float = 8.0, change_after: int = 10, warmup: int = 150) -> Logic:
-    """Distance to each label's set plus a penalty per fault; for labels of several simultaneous faults.
+def chi_square(memory: int = 20) -> Statistic:
+    """Exponentially weighted mean of nu' S^-1 nu, less its expectation."""
 
-    The label changes when the same other one has been the best for `change_after` consecutive samples. Silent for the
-    first `warmup` samples.
-    """
-    groups, p = manifolds(plant), len(plant.estimated)
-    faults = np.array([len(label.modes) for label in plant.labels])
+    def step(mean: Array, r: Reading, informed: Array) -> tuple[Array, Array]:
+        mean = np.where(informed, mean + (_excess(r) - mean) / memory, mean)
+        return mean, mean
 
-    def start(n: int) -> tuple[Array, ...]:
-        return tuple(np.zeros(n, np.int64) for _ in range(3))
-
-    def step(state: tuple[Array, ...], k: int, z: Array, P: Array) -> tuple[tuple[Array, ...], Decision]:
-        label, candidate, count = state
-        n = len(z)
-        if k <= warmup:
-            return state, Decision(np.zeros(n, bool), label, np.zeros((n, p)))
-        fits = fit(z, P, groups)
-        cost = np.column_stack([fits.J_healthy, fits.J + penalty * faults[fits.labels]])
-        best = np.append(0, fits.labels)[np.argmin(cost, axis=1)]
-        count = np.where(best == label, 0, np.where(best == candidate, count + 1, 1))
-        label = np.where(count == change_after, best, label)
-        return (label, best, np.where(count == change_after, 0, count)), Decision(label > 0, label, _structured(fits, label))
-
-    return Logic(start, step)
+    return Statistic(lambda n, m: np.zeros(n), step)
 
 
-def persistence_logic(plant: Plant, candidate: Callable[[Array], Array], *, after: int = 20, warmup: int = 150) -> Logic:
-    """The label becomes the candidate at the `after`-th consecutive sample on which that is the same.
+def cusum(allowance: float = 0.5) -> Statistic:
+    """g+ = max(0, g + nu' S^-1 nu - (1 + allowance) m): grows where the innovations are too large by the allowance."""
+
+    def step(g: Array, r: Reading, informed: Array) -> tuple[Array, Array]:
+        g = np.where(informed, np.maximum(0.0, g + _excess(r) - allowance * np.asarray(r.seen)), g)
+        return g, g
+
+    return Statistic(lambda n, m: np.zeros(n), step)
+
+
+def glr(windows: tuple[int, ...] = (2, 5, 10, 20, 40)) -> Statistic:
+    """max over windows w of |sum of the last w whitened innovations|^2 / w."""
+    longest = max(windows)
+
+    def start(n: int, m: int) -> Any:
+        return np.zeros(n, np.int64), np.zeros((n, longest + 1, m))
+
+    def step(state: Any, r: Reading, informed: Array) -> tuple[Any, Array]:
+        count, sums = state
+        assert r.nu is not None
+        assert r.S is not None
+        white = np.linalg.solve(np.linalg.cholesky(r.S), r.nu[..., None])[..., 0]
+        moved = np.concatenate([sums[:, 1:], sums[:, -1:] + white[:, None]], axis=1)
+        sums = np.where(informed[:, None, None], moved, sums)
+        count = count + informed
+        ratios = [
+            np.where(count >= w, ((sums[:, -1] - sums[:, -1 - w]) ** 2).sum(axis=1) / w, 0.0) for w in windows
+        ]  # fmt: skip
+        return (count, sums), np.max(ratios, axis=0)
+
+    return Statistic(start, step)
+
+
+STATISTICS: dict[str, Callable[[], Statistic]] = {"chi-square": chi_square, "cusum": cusum, "glr": glr}
+DECISIONS = ("distance", "thresholds", *STATISTICS)
+QUARTER = 0.25  # of a typical fault: what LEAST is in the fixed metric of "thresholds"
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Rules
+
+
+def by_labels(
+    plant: Plant, calibration: Calibration, decision: str = "distance", *, size: Array | None = None, on_line: bool = False
+) -> Rule:
+    """Labels by how badly they fit, beyond the thresholds of their modes.
 
     Args:
-        plant: The plant.
-        candidate: Maps the estimate's deviation from healthy (n, p) to a label (n,), sample by sample.
-        after: Persistence in samples.
-        warmup: Samples without a decision and without counting; the candidate before them is 0.
+        plant: The plant; the entries of the estimate are those of `plant.estimated`.
+        calibration: The thresholds, the excess covariance and the persistence.
+        decision: "distance": in the metric of the estimate's covariance. "thresholds": in a fixed metric, which makes
+            them thresholds on the estimate, never below a quarter of a typical fault. "chi-square", "cusum", "glr":
+            the distance, but the alarm is raised by that statistic of the innovations.
+        size: Typical fault sizes (p,), the metric of "thresholds".
+        on_line: Report the point of the declared label's own set that is closest to the estimate, and healthy where none is
+            declared.
+
+    Raises:
+        ValueError: Unknown decision, "thresholds" without sizes, or a calibration of another plant.
     """
-    p = len(plant.estimated)
+    if decision not in DECISIONS:
+        raise ValueError(f"unknown decision {decision!r}; there are {', '.join(DECISIONS)}")
+    if decision == "thresholds" and size is None:
+        raise ValueError("the decision 'thresholds' needs the typical fault sizes")
+    groups, penalty, after = manifolds(plant), calibration.penalties(plant), calibration.persistence
+    statistic = STATISTICS[decision]() if decision in STATISTICS else None
+    fixed = np.diag((QUARTER * size) ** 2 / LEAST)[None] if decision == "thresholds" and size is not None else None
+    m, p = len(plant.outputs), len(plant.estimated)
+    excess = np.zeros((p, p)) if calibration.excess is None else calibration.excess
 
-    def start(n: int) -> tuple[Array, ...]:
-        return tuple(np.zeros(n, np.int64) for _ in range(3))
+    def start(n: int) -> Any:
+        return undeclared(n), None
 
-    def step(state: tuple[Array, ...], k: int, z: Array, P: Array) -> tuple[tuple[Array, ...], Decision]:
-        label, last, count = state
-        n = len(z)
-        if k <= warmup:
-            return state, Decision(np.zeros(n, bool), label, np.zeros((n, p)))
-        now = candidate(z)
-        count = np.where(now == last, count + 1, 1)
-        label = np.where(count == after, now, label)
-        return (label, now, count), Decision(label > 0, label, np.where((label > 0)[:, None], z, 0.0))
-
-    return Logic(start, step)
-
-
-def surface_candidate(plant: Plant, *, loss: float = 0.4, total: float = 0.8, position: dict[str, float]) -> Callable:
-    """Fixed thresholds on the effectiveness and position of each control surface.
-
-    The surface with the largest max(-gamma / loss, |b| / position) is faulty where that exceeds 1: stuck if
-    -gamma > total or |b| exceeds its position limit, else LOE. For plants whose estimate has the entries gamma_<surface>
-    and b_<surface> and whose modes are "<surface> LOE" and "<surface> stuck".
-    """
-    names = [s.name for s in plant.estimated]
-    gamma = [names.index(f"gamma_{surface}") for surface in position]
-    b = [names.index(f"b_{surface}") for surface in position]
-    limit = np.array(list(position.values()))
-    lost = np.array([plant.label_of(frozenset({f"{surface} LOE"})) for surface in position])
-    stuck = np.array([plant.label_of(frozenset({f"{surface} stuck"})) for surface in position])
-
-    def candidate(z: Array) -> Array:
-        loss_of, place = -z[:, gamma], np.abs(z[:, b])
-        severity = np.maximum(loss_of / loss, place / limit)
-        s = np.argmax(severity, axis=1)
-        i = np.arange(len(z))
-        is_stuck = (loss_of[i, s] > total) | (place[i, s] > limit[s])
-        return np.where(severity[i, s] <= 1, 0, np.where(is_stuck, stuck[s], lost[s]))
-
-    return candidate
-
-
-def with_logic(
-    plant: Plant,
-    first: Callable[[int], Any],
-    advance: Callable[[Any, Array, Array], Any],
-    logic: Logic,
-    structured: bool = False,
-) -> Diagnoser:
-    """A diagnoser from a parameter-estimating filter and a decision logic.
-
-    Args:
-        plant: The plant.
-        first: first(n) gives the filter's state, with the fields z (n, p), the estimate's deviation from healthy, and
-            Pz (n, p, p), its covariance.
-        advance: advance(state, u, y) gives the next one from the command u_{k-1} and the measurement y_k.
-        logic: The decision logic.
-        structured: Report the magnitude along the declared label's own line in place of the free estimate.
-    """
-    healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
-
-    def init(n: int) -> Any:
-        return 0, first(n), logic.start(n)
-
-    def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
-        k, s, decided = state
-        n = len(obs)
-        if k == 0:  # no interval has ended: the filter keeps its prior
-            said = Decision(np.zeros(n, bool), np.zeros(n, np.int64), np.zeros_like(s.z))
+    def step(state: Any, k: Array, r: Reading, informed: Array) -> tuple[Any, Verdict]:
+        declared, tested = state
+        cost, found = r.cost, None
+        if cost is None:
+            assert r.z is not None
+            assert r.P is not None
+            found = distances(r.z, r.P + excess if fixed is None else fixed, groups)
+            cost = np.empty((len(r.z), len(plant.labels)))
+            cost[:, 0], cost[:, found.labels] = found.J_healthy, found.J
+        share = gain(cost, penalty)
+        informed = informed & (k > after.warmup)
+        rise = None
+        over: Array = share > 1.0
+        if statistic is not None:
+            tested = statistic.start(len(cost), r.nu.shape[1] if r.nu is not None else m) if tested is None else tested
+            tested, rise = statistic.step(tested, r, informed)
+            over = rise > (np.inf if calibration.rise is None else calibration.rise)
+        if after.same:  # health is a label like the others
+            best = np.argmin(cost + penalty, axis=1)
+            over, under = best > 0, np.zeros(len(best), bool)
         else:
-            y, u, _ = plant.split(obs)
-            s = advance(s, u, y)
-            decided, said = logic.step(decided, k, s.z, s.Pz)
-        std = np.sqrt(np.einsum("npp->np", s.Pz))
-        theta = healthy + (said.structured if structured else s.z)
-        return (k + 1, s, decided), Diagnosis(said.alarm, said.label, theta, std)
+            best, under = 1 + np.argmin(cost[:, 1:] + penalty[1:], axis=1), share < 0.5
+        declared = declare(declared, best, over, under, after, informed)
+        z = None
+        if on_line and found is not None:
+            z = (found.deviation * (found.labels == declared.label[:, None])[..., None]).sum(axis=1)
+        return (declared, tested), Verdict(declared.label > 0, declared.label, z, Evidence(cost, rise))
 
-    return Diagnoser(init, update)
+    return Rule(start, step)
+
+
+def by_candidate(candidate: Callable[[Reading, Array], Array], after: int, warmup: int = 0) -> Rule:
+    """The label becomes the candidate at the `after`-th sample in a row on which that is the same.
+
+    Args:
+        candidate: Maps a reading and the label declared so far (n,) to a label (n,).
+        after: Samples in a row.
+        warmup: Samples without a decision and without counting.
+    """
+    persistence = Persistence(after, after, after, warmup, same=True)
+
+    def step(s: Declared, k: Array, r: Reading, informed: Array) -> tuple[Declared, Verdict]:
+        now = candidate(r, s.label)
+        s = declare(s, now, now > 0, np.zeros(len(now), bool), persistence, informed & (k > warmup))
+        return s, Verdict(s.label > 0, s.label)
+
+    return Rule(undeclared, step)
+
+
+CHANNELS = Persistence(3, 1, 20)
+
+
+def by_channels(plant: Plant, inputs: FaultInputs, alpha: float, thresholds: Array, after: Persistence = CHANNELS) -> Rule:
+    """Each entry of the fault vector, smoothed: s+ = (1 - alpha) s + alpha z; on above its threshold, off below half of it.
+
+    The label is the set of entries that are on.
+
+    Args:
+        plant: The plant.
+        inputs: The fault channels; the reading's z is of the whole estimated space.
+        alpha: Smoothing factor.
+        thresholds: One per channel (p,), in the unit of the estimate.
+        after: Samples in a row that switch a channel on and off.
+
+    Raises:
+        ValueError: Not one threshold per channel.
+    """
+    J = np.asarray(thresholds, float)
+    if J.shape != (len(inputs.names),):
+        raise ValueError(f"one threshold per channel ({', '.join(inputs.names)}) is needed, not {np.asarray(J).tolist()}")
+    labels, sets = channel_sets(plant, inputs)
+
+    def start(n: int) -> Any:
+        return np.zeros((n, len(J))), undeclared((n, len(J)))
+
+    def step(state: Any, k: Array, r: Reading, informed: Array) -> tuple[Any, Verdict]:
+        smooth, declared = state
+        assert r.z is not None
+        informed = (informed & (k > after.warmup))[:, None]
+        smooth = np.where(informed, (1 - alpha) * smooth + alpha * r.z[:, inputs.estimated], smooth)
+        size = np.abs(smooth)
+        on = np.ones(size.shape, np.int64)
+        declared = declare(declared, on, size > J, size < 0.5 * J, after, np.broadcast_to(informed, size.shape))
+        label = label_of_channels(labels, sets, declared.label > 0, size / J)
+        alarm = np.any(declared.label > 0, axis=1)
+        return (smooth, declared), Verdict(alarm, label, None, Evidence(channels=size))
+
+    return Rule(start, step)

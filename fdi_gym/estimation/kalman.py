@@ -1,4 +1,4 @@
-"""The Kalman filter's two halves, on stacks of episodes: x (n, n_x), P (n, n_x, n_x)."""
+"""The Kalman filter's algebra on stacks of episodes: x (n, n_x), P (n, n_x, n_x)."""
 
 from __future__ import annotations
 
@@ -41,22 +41,59 @@ def right_divide(M: Array, S: Array) -> Array:
 
 
 def quadratic(v: Array, S: Array) -> Array:
-    """v' S^-1 v for each episode: (n,)."""
-    return np.einsum("ni,ni->n", v, solve(S, v[..., None])[..., 0])
+    """v' S^-1 v (...,) for each vector (..., m)."""
+    return (v * solve(S, v[..., None])[..., 0]).sum(axis=-1)
 
 
-class Updated(NamedTuple):
+def log_likelihood(nu: Array, S: Array) -> Array:
+    """log N(nu; 0, S) (...,) without its constant. Sensors that were masked (see `masked`) count for nothing."""
+    return -0.5 * (quadratic(nu, S) + np.linalg.slogdet(S)[1])
+
+
+def masked(seen: Array, nu: Array, S: Array, *crosses: Array) -> tuple[Array, ...]:
+    """Innovation, its covariance and crosses with it, so that only the sensors that reported act.
+
+    The filter with these is the filter whose missing rows were removed: a missing sensor has innovation 0, variance 1 and
+    no covariance with anything.
+
+    Args:
+        seen: (n, m) bool.
+        nu: Innovation (n, m).
+        S: Its covariance (n, m, m).
+        crosses: (n, ..., N, m) each, covariance of something with the measurement.
+    """
+    if seen.all():
+        return nu, S, *crosses
+    both = seen[:, :, None] & seen[:, None, :]
+    lone = np.eye(seen.shape[1], dtype=bool) & ~seen[:, :, None]
+    return (
+        np.where(seen, nu, 0.0),
+        np.where(both, S, 0.0) + lone,
+        *(np.where(seen.reshape(len(seen), *[1] * (C.ndim - 2), -1), C, 0.0) for C in crosses),
+    )
+
+
+class Corrected(NamedTuple):
     """Outcome of a measurement update."""
 
     x: Array  # (n, n_x)
     P: Array  # (n, n_x, n_x)
-    K: Array  # gain (n, n_x, n_y)
-    S: Array  # innovation covariance (n, n_y, n_y)
+    nu: Array  # innovation (n, m)
+    S: Array  # its covariance (n, m, m)
+    K: Array  # gain (n, n_x, m)
 
 
-def update(x: Array, P: Array, innovation: Array, H: Array, R: Array) -> Updated:
-    """Measurement update with the innovation (n, n_y): K = P H' S^-1, S = H P H' + R."""
-    PHt = P @ T(H)
-    S = H @ PHt + R
-    K = right_divide(PHt, S)
-    return Updated(x + times(K, innovation), symmetric(P - K @ H @ P), K, S)
+def correct(x: Array, P: Array, nu: Array, cross: Array, S: Array, seen: Array) -> Corrected:
+    """Measurement update from the innovation (n, m), its covariance and that of the state with the measurement (n, n_x, m).
+
+    K = cross S^-1, x + K nu, P - K cross', with the sensors that reported.
+    """
+    nu, S, cross = masked(seen, nu, S, cross)
+    K = right_divide(cross, S)
+    return Corrected(x + times(K, nu), symmetric(P - K @ T(cross)), nu, S, K)
+
+
+def update(x: Array, P: Array, nu: Array, H: Array, R: Array, seen: Array) -> Corrected:
+    """Measurement update with linear sensors: H (m, n_x) or (n, m, n_x), R (m, m)."""
+    cross = P @ T(H)
+    return correct(x, P, nu, cross, H @ cross + R, seen)

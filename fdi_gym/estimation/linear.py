@@ -1,4 +1,4 @@
-"""The matrices of a linear plant, read off its compiled model."""
+"""The matrices of a linear plant, and of linear sensors, read off the compiled model."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi_gym.diagnosis import NotApplicableError
-from fdi_gym.plant import Array, Plant
+from fdi_gym.plant import Array, NotApplicableError, Plant
 
 
 class LinearModel(NamedTuple):
@@ -46,3 +45,22 @@ def linear_model(plant: Plant) -> LinearModel:
     E0 = E(zero_u)
     Eu = np.stack([E(np.eye(n_u)[i : i + 1]) - E0 for i in range(n_u)])
     return LinearModel(A, B, C, E0, Eu)
+
+
+def linear_output(plant: Plant, sensors: Array | None = None) -> Array:
+    """H (m, n_x) of a plant with y = H x, for these of its sensors (m,); all by default.
+
+    Raises:
+        NotApplicableError: The sensors are not linear in the state, or see the command, a fault or the disturbance.
+    """
+    n_x, which = len(plant.states), np.arange(len(plant.outputs)) if sensors is None else sensors
+    rng = np.random.default_rng(0)
+    HT = plant.measure(0.0, np.eye(n_x), plant.trim_command) - plant.measure(0.0, np.zeros(n_x), plant.trim_command)
+    H = HT.take(which, axis=1).T
+    x = rng.standard_normal((8, n_x))
+    u = plant.trim_command + rng.standard_normal((8, len(plant.commands)))
+    theta = plant.nominal_theta + rng.standard_normal((8, len(plant.theta)))
+    d = rng.standard_normal((8, len(plant.disturbances))) if plant.disturbances else None
+    if not np.allclose(plant.measure(0.0, x, u, theta, d)[:, which], x @ H.T, rtol=1e-9, atol=1e-9):
+        raise NotApplicableError(f"needs sensors y = H x; those of {plant.id} are not")
+    return H

@@ -18,59 +18,8 @@ from fdi_gym.estimation.kalman import T, symmetric
 from fdi_gym.plant import Array, Plant
 
 
-class FaultInputs(NamedTuple):
-    """Where the fault vector b (n, p) that a filter estimates enters the plant: theta = nominal + b on `entries`."""
-
-    names: tuple[str, ...]
-    estimated: Array  # (p,) positions in plant.estimated
-    entries: Array  # (p,) positions in plant.theta
-
-    def theta(self, plant: Plant, b: Array) -> Array:
-        """The fault parameter (n, n_theta) that b (n, p) stands for."""
-        theta = np.tile(plant.nominal_theta, (len(b), 1))
-        theta[:, self.entries] += b
-        return theta
 
 
-def fault_inputs(plant: Plant, channels: Sequence[str] | None = None) -> FaultInputs:
-    """The fault vector of a plant: the named entries of `plant.estimated`, all of them by default.
-
-    An estimated quantity is a theta entry of the same name, or it is the error of a command, which enters additively
-    through the theta entry "offset_<name>".
-
-    Raises:
-        NotApplicableError: An unknown name, or a quantity that is neither.
-    """
-    asked, entries = [s.name for s in plant.estimated], [s.name for s in plant.theta]
-    names = tuple(asked if channels is None else channels)
-    if not names or set(names) - set(asked) or len(set(names)) < len(names):
-        raise NotApplicableError(f"channels are different ones of {', '.join(asked)}, not {', '.join(names) or 'none'}")
-    found = []
-    for name in names:
-        entry = name if name in entries else f"offset_{name}"
-        if entry not in entries:
-            raise NotApplicableError(f"{plant.id} has no theta entry through which {name!r} enters additively")
-        found.append(entries.index(entry))
-    return FaultInputs(names, np.array([asked.index(n) for n in names]), np.array(found))
-
-
-def linear_output(plant: Plant, sensors: Array | None = None) -> Array:
-    """H (m, n_x) of a plant with y = H x, for these of its sensors (m,); all by default.
-
-    Raises:
-        NotApplicableError: The sensors are not linear in the state, or see the command, a fault or the disturbance.
-    """
-    n_x, which = len(plant.states), np.arange(len(plant.outputs)) if sensors is None else sensors
-    rng = np.random.default_rng(0)
-    HT = plant.measure(0.0, np.eye(n_x), plant.trim_command) - plant.measure(0.0, np.zeros(n_x), plant.trim_command)
-    H = HT.take(which, axis=1).T
-    x = rng.standard_normal((8, n_x))
-    u = plant.trim_command + rng.standard_normal((8, len(plant.commands)))
-    theta = plant.nominal_theta + rng.standard_normal((8, len(plant.theta)))
-    d = rng.standard_normal((8, len(plant.disturbances))) if plant.disturbances else None
-    if not np.allclose(plant.measure(0.0, x, u, theta, d)[:, which], x @ H.T, rtol=1e-9, atol=1e-9):
-        raise NotApplicableError(f"needs sensors y = H x; those of {plant.id} are not")
-    return H
 
 
 class Propagated(NamedTuple):

@@ -1,0 +1,111 @@
+"""What a diagnoser is, and how one is shown a flight.
+
+A diagnoser is a pair of functions, batched over n episodes:
+
+    init(n) -> state
+    update(state, obs) -> (state, Diagnosis)      # obs (n, n_obs): the samples k = 0, 1, ... in turn
+
+The state is any nest of tuples, NamedTuples, lists and dicts. Its arrays have the episodes along their first axis; a
+plain number in it (a sample counter) is shared by all episodes. NaN in an observation says that this sensor did not report
+at this sample. `fdi_gym.diagnosis.filtering` makes a diagnoser of a filter and a decision rule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fdi_gym.plant import Array
+
+
+class Diagnosis(NamedTuple):
+    """What a diagnoser says after a sample about the interval that has just ended, for n episodes.
+
+    A method that does not isolate gives label 0 or any guess with its alarm; what a method does not give is None.
+    """
+
+    alarm: Array  # (n,) bool: there is a fault
+    label: Array  # (n,) int: label index
+    estimate: Array | None = None  # (n, n_estimated) estimate of what the identification task asks for
+    estimate_std: Array | None = None  # (n, n_estimated) its standard deviation
+    label_probs: Array | None = None  # (n, labels) probabilities, where the method has them
+    state: Array | None = None  # (n, n_x) estimate of the plant's state
+    signals: dict[str, Array] | None = None  # (n, ...) each: residuals, thresholds, an approximated fault function
+
+
+class Diagnoser(NamedTuple):
+    """A pair of functions; see the module's docstring.
+
+    `gaps` says that the method handles samples in which sensors are missing. The others are held: they are not shown
+    such a sample, and what they said stands.
+    """
+
+    init: Callable[[int], Any]
+    update: Callable[[Any, Array], tuple[Any, Diagnosis]]
+    gaps: bool = False
+    filter: Any = None  # the `filtering.Filter` that it is made of, where it is
+    rule: Any = None  # and the `estimation.decision.Rule`
+
+
+class Decisions(NamedTuple):
+    """What a diagnoser said over recorded flights: the fields of `Diagnosis` with samples along the second axis."""
+
+    alarm: Array  # (N, K + 1) bool
+    label: Array  # (N, K + 1) int16
+    estimate: Array | None  # (N, K + 1, n_estimated)
+    estimate_std: Array | None
+    label_probs: Array | None  # (N, K + 1, labels)
+    state: Array | None = None  # (N, K + 1, n_x)
+    signals: dict[str, Array] | None = None  # (N, K + 1, ...) each, where they were asked for
+
+
+def run(diagnoser: Diagnoser, obs: Array, signals: bool = False) -> Decisions:
+    """Show recorded observations (N, K + 1, n_obs) to a diagnoser, sample by sample, and record what it says.
+
+    Args:
+        diagnoser: The diagnoser.
+        obs: The observations.
+        signals: Record the method's own signals too.
+    """
+    n, samples, _ = obs.shape
+    state = diagnoser.init(n)
+    alarm, label = np.zeros((n, samples), bool), np.zeros((n, samples), np.int16)
+    wide: dict[str, Array | None] = dict.fromkeys(("estimate", "estimate_std", "label_probs", "state"))
+    own: dict[str, Array] = {}
+    for k in range(samples):
+        state, said = diagnoser.update(state, obs[:, k])
+        alarm[:, k], label[:, k] = said.alarm, said.label
+        for name in wide:
+            value = getattr(said, name)
+            if value is not None:
+                store = wide[name]
+                if store is None:
+                    store = wide[name] = np.full((n, samples, value.shape[1]), np.nan)
+                store[:, k] = value
+        for name, value in (said.signals or {}).items() if signals else ():
+            own.setdefault(name, np.full((n, samples, *value.shape[1:]), np.nan))[:, k] = value
+    return Decisions(alarm, label, **wide, signals=own or None)
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# States, as nests of arrays
+
+
+def map_arrays(function: Callable[..., Any], *nests: Any) -> Any:
+    """Apply to the arrays of equal nests; other leaves are those of the first."""
+    first = nests[0]
+    if isinstance(first, np.ndarray):
+        return function(*nests)
+    if isinstance(first, dict):
+        return {key: map_arrays(function, *(nest[key] for nest in nests)) for key in first}
+    if isinstance(first, (tuple, list)):
+        parts = [map_arrays(function, *branches) for branches in zip(*nests, strict=True)]
+        return type(first)(*parts) if hasattr(first, "_fields") else type(first)(parts)
+    return first
+
+
+def choose(mask: Array, yes: Any, no: Any) -> Any:
+    """The nest whose episodes are those of `yes` where the mask is set, else those of `no`."""
+    return map_arrays(lambda a, b: np.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b), yes, no)

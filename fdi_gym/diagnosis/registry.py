@@ -1,0 +1,201 @@
+"""Diagnosers by name: how a builder is made known, found, told what it may know, and built.
+
+A builder makes a diagnoser from a plant and from data; it flies nothing and reads no file:
+
+    @diagnoser("two_stage_kf", "Two-stage Kalman filter")
+    def two_stage_kf(plant: Plant, *, forgetting: str = "none") -> Diagnoser: ...
+
+    @diagnoser("augmented_ekf", "Augmented extended Kalman filter")
+    def augmented_ekf(plant: Plant, belief: Belief, calibration: Calibration, *, walk: float = 1.0) -> Diagnoser: ...
+
+Arguments of these names are given: `belief` and `calibration` are what `fdi_gym.diagnosis.fit` found for the fault process
+that will be met, `process` is that process's name, `scenarios` the truth, for ceilings only. All others are tuning. Builders
+in the modules and packages of the entry-point group "fdi_gym.diagnosers" are discovered; none is listed.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import importlib
+import inspect
+import json
+import pkgutil
+from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from fdi_gym.diagnosis.contract import Diagnoser
+from fdi_gym.diagnosis.guard import guarded
+from fdi_gym.plant import Plant
+
+GIVEN = ("belief", "calibration", "process", "scenarios")  # arguments of a builder that are no tuning
+
+
+class Entry(NamedTuple):
+    """A diagnoser that can be asked for by name."""
+
+    name: str
+    summary: str
+    build: Callable[..., Diagnoser]
+    settings: Mapping[str, Any]  # that belong to the name
+    clairvoyant: bool
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """The keywords of its builder, without the plant."""
+        return tuple(inspect.signature(self.build).parameters)[1:]
+
+    def takes(self, argument: str) -> bool:
+        """Whether its builder has this argument."""
+        return argument in self.parameters
+
+    def resolve(self, plant: Plant, **tuning: Any) -> dict[str, Any]:
+        """All tuning that its builder gets: the caller's over the name's over the paper's own for this plant.
+
+        Raises:
+            ValueError: The builder has no such keyword.
+        """
+        asked = {**self.settings, **tuning}
+        settings = {**paper_tuning(self, plant, asked), **asked}
+        allowed = [name for name in self.parameters if name not in GIVEN]
+        for key in settings:
+            if key not in allowed:
+                raise ValueError(f"{self.name} has no setting {key!r}; it has {', '.join(allowed) or 'none'}")
+        return settings
+
+
+def package_of(entry: Entry) -> Path | None:
+    """The folder of the package that a diagnoser belongs to; None where there is none."""
+    name = entry.build.__module__.split(".")[0]
+    file = getattr(importlib.import_module(name), "__file__", None)
+    return Path(file).parent if file else None
+
+
+@functools.cache
+def _tuning_file(path: Path) -> list[dict[str, Any]]:
+    return json.loads(path.read_bytes()) if path.is_file() else []
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def paper_tuning(entry: Entry, plant: Plant, asked: Mapping[str, Any]) -> dict[str, Any]:
+    """What a method's paper gives for a plant: from `tuning/<Plant>.json` in the package of the method.
+
+    The file is a list of {"methods": names, "options": options of the plant, "asked": settings that are asked for,
+    "settings": ...}; an item holds where the method is named, the plant has these options, and these settings are asked
+    for (null: not asked for).
+    """
+    home = package_of(entry)
+    found: dict[str, Any] = {}
+    for item in _tuning_file(home / "tuning" / f"{plant.id}.json") if home else ():
+        options, given = item.get("options", {}), item.get("asked", {})
+        if (
+            entry.name in item["methods"]
+            and all(plant.options.get(k) == v for k, v in options.items())
+            and all(_plain(asked.get(k)) == v for k, v in given.items())
+        ):
+            found |= item["settings"]
+    return found
+
+
+_entries: dict[str, Entry] = {}
+
+
+def diagnoser(name: str, summary: str, *, clairvoyant: bool = False, **settings: Any) -> Callable[[Any], Any]:
+    """Make a builder known under a name. Stacked, it gives one builder several names with different settings.
+
+    Args:
+        name: As users and tables call it.
+        summary: One line for tables.
+        clairvoyant: The builder takes `scenarios=`, one per episode, and its row says that it knows the truth.
+        settings: Keyword arguments of the builder that belong to this name.
+
+    Raises:
+        ValueError: The name is taken, or the builder has no such keyword.
+    """
+
+    def register(build: Callable[..., Diagnoser]) -> Callable[..., Diagnoser]:
+        taken = _entries.get(name)
+        if taken is not None and (taken.build.__module__, taken.build.__qualname__) != (
+            build.__module__, build.__qualname__,
+        ):  # fmt: skip
+            raise ValueError(f"two diagnosers are called {name!r}: {taken.build.__module__} and {build.__module__}")
+        allowed = inspect.signature(build).parameters
+        for setting in settings:
+            if setting not in allowed:
+                raise ValueError(f"{build.__name__} has no setting {setting!r}; it has {', '.join(allowed)}")
+        _entries[name] = Entry(name, summary, build, settings, clairvoyant)
+        return build
+
+    return register
+
+
+@functools.cache
+def _import_packages() -> None:
+    for entry_point in entry_points(group="fdi_gym.diagnosers"):
+        place = entry_point.load()
+        for module in pkgutil.walk_packages(getattr(place, "__path__", []), place.__name__ + "."):
+            importlib.import_module(module.name)
+
+
+def diagnosers() -> dict[str, Entry]:
+    """All diagnosers by name, in the order in which their modules declare them."""
+    _import_packages()
+    return dict(_entries)
+
+
+def find_diagnoser(name: str) -> Entry:
+    """The diagnoser of this name; "module:function" names a builder that is not discovered.
+
+    Raises:
+        ValueError: There is none; the message lists those that exist.
+    """
+    if ":" in name:
+        module, function = name.split(":", 1)
+        try:
+            build = getattr(importlib.import_module(module), function)
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"no diagnoser {name!r}: {error}") from error
+        return Entry(name, (inspect.getdoc(build) or name).splitlines()[0], build, {}, False)
+    found = diagnosers()
+    if name not in found:
+        near = difflib.get_close_matches(name, found, 1)
+        hint = f" (did you mean {near[0]!r}?)" if near else ""
+        raise ValueError(f"unknown diagnoser {name!r}{hint}; there are {', '.join(found)}")
+    return found[name]
+
+
+def make_diagnoser(
+    name: str, plant: Plant, *, process: str = "standard", scenarios: Sequence[Any] | None = None, **tuning: Any
+) -> Diagnoser:
+    """A diagnoser by name, for a plant and one of its fault processes, under the guard (see `guarded`).
+
+    What it believes and when it alarms is what `fdi_gym.diagnosis.fit` found for that process: shipped where it is, else
+    found when it is first asked for.
+
+    Args:
+        name: As in `find_diagnoser`.
+        plant: The plant whose model it gets.
+        process: The fault process that it will meet.
+        scenarios: The truth, one per episode; only a clairvoyant one gets it.
+        tuning: Keyword arguments of its builder, over those of the name, which are over its paper's own for the plant.
+
+    Raises:
+        ValueError: Unknown name, process or keyword; `NotApplicableError` where the method cannot run on this plant.
+    """
+    from fdi_gym.diagnosis.fit import knowledge_of
+
+    entry = find_diagnoser(name)
+    plant.process(process)
+    settings = entry.resolve(plant, **tuning)
+    given: dict[str, Any] = {"process": process} if entry.takes("process") else {}
+    if entry.clairvoyant:
+        if scenarios is None:
+            raise ValueError(f"{name} knows the truth: it needs scenarios, one per episode")
+        given["scenarios"] = scenarios
+    given |= knowledge_of(entry, plant, process, settings, scenarios)
+    return guarded(entry.build(plant, **given, **settings), plant)
