@@ -194,7 +194,10 @@ def check_streams(plant: Plant, seed: int = 3) -> None:
 def check_diagnoser(
     build: Callable[[Plant, Sequence[FaultScenario]], Diagnoser], plant: Plant, seed: int = 11, samples: int = 300
 ) -> None:
-    """Shapes, determinism, batch independence, no look-ahead, and a NaN in the measurement.
+    """Shapes, determinism, batch independence, no look-ahead, and gaps in the measurement.
+
+    A method that handles gaps must stay quiet through them and keep its accuracy; the others, which the guard holds, must not
+    be lost.
 
     Args:
         build: Makes the diagnoser from the plant; the scenarios are for clairvoyant ones.
@@ -214,7 +217,7 @@ def check_diagnoser(
     said = run(fresh(everyone), obs, signals=True)
     shown = _arrays(said)
     n_labels = len(plant.labels)
-    assert ((said.label >= -1) & (said.label < n_labels)).all(), "a mode is no label"
+    assert ((said.label >= -1) & (said.label < n_labels)).all(), "what is declared is no label"
     if said.label_probs is not None:
         probs = said.label_probs
         assert (probs >= -1e-9).all(), "a probability is negative"
@@ -243,6 +246,34 @@ def check_diagnoser(
     _equal(_pick(shown, rest), _pick(_arrays(hurt), rest), "a NaN in one episode reaches another", 1e-6)
     assert (hurt.label[1] >= 0).all(), "a dropout loses the episode"
     assert hurt.estimate is None or np.isfinite(hurt.estimate[1]).all(), "a dropout leaves a NaN in the estimate"
+    _check_gaps(fresh(everyone), plant, scenarios, obs, said)
+
+
+GAPS = (1, 5, 10, 20)  # samples
+
+
+def with_gaps(obs: Array, plant: Plant) -> Array:
+    """Observations (N, K, n_obs) with gaps of 1 to 20 samples, one sensor missing every seventh, and nothing at first."""
+    found, k = obs.copy(), obs.shape[1] // 3
+    found[:, 0] = np.nan
+    for length in GAPS:
+        found[:, k : k + length] = np.nan
+        k += length + obs.shape[1] // 12
+    found[:, ::7, len(plant.outputs) // 2] = np.nan
+    return found
+
+
+def _check_gaps(diagnoser: Diagnoser, plant: Plant, scenarios: Sequence[FaultScenario], obs: Array, said: Decisions) -> None:
+    """Through gaps a method stays as quiet as without them, and as right."""
+    hurt = run(diagnoser, with_gaps(obs, plant))
+    assert (hurt.label >= 0).all() or (said.label < 0).any(), "gaps lose an episode"
+    if not diagnoser.gaps:
+        return
+    truth = np.stack([plant.label_rows(s)[: obs.shape[1]] for s in scenarios])
+    right, right_hurt = ((d.label == truth).mean() for d in (said, hurt))
+    assert right_hurt >= right - 0.15, f"gaps cost accuracy: {right:.2f} without, {right_hurt:.2f} with"
+    alarms, alarms_hurt = ((d.alarm & (truth == 0)).mean() for d in (said, hurt))
+    assert alarms_hurt <= alarms + 0.05, f"gaps raise false alarms: {alarms:.3f} of the samples without, {alarms_hurt:.3f} with"
 
 
 def _arrays(said: Decisions) -> dict[str, Array]:

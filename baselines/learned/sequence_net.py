@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from baselines.learned import network_module
-from fdi_gym.diagnosis import Diagnoser, Diagnosis, NotApplicableError, diagnoser, diagnosers, make_diagnoser, told
+from fdi_gym.diagnosis import Diagnoser, Diagnosis, NotApplicableError, diagnoser, diagnosers, make_diagnoser
 from fdi_gym.plant import Array, Plant
 from fdi_gym.training import trainer
 
@@ -70,7 +70,7 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
     scale, bias, prior = fitted.scale, np.array(fitted.bias), np.array(fitted.prior)
     healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
     unit = np.array([s.scale for s in plant.estimated])
-    heard = [make_diagnoser(name, plant, **told(name, expected)) for name in card.filters]
+    heard = [make_diagnoser(name, plant, process=expected) for name in card.filters]
 
     def init(n: int) -> Any:
         said = Diagnosis(np.zeros(n, bool), np.zeros(n, np.int64), np.tile(healthy, (n, 1)), np.tile(unit, (n, 1)),
