@@ -7,7 +7,6 @@ returns a `Plant`. It is discovered; nothing is listed. A plant outside the pack
 
 from __future__ import annotations
 
-import copyreg
 import dataclasses
 import functools
 import importlib
@@ -16,6 +15,7 @@ import itertools
 import math
 import re
 import reprlib
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -128,6 +128,25 @@ def _no_change(physical: Mapping[str, Any]) -> Array:
     if physical:
         raise ValueError(f"this plant has no physical parameters to change, but the scenario sets {', '.join(physical)}")
     return np.zeros(0)
+
+
+class _Sent:
+    """A kernel under way to another process: by its name where it has one, else by its source; compiled there."""
+
+    def __init__(self, dispatcher: Any):
+        self.dispatcher = dispatcher
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        from fdi_gym import kernels
+
+        function = self.dispatcher.py_func
+        if getattr(sys.modules.get(function.__module__), function.__name__, None) is self.dispatcher:
+            return _arrived, (function.__module__, function.__name__)
+        return kernels.kernel, (function,)
+
+
+def _arrived(module: str, name: str) -> Any:
+    return getattr(importlib.import_module(module), name)
 
 
 class _ByName:
@@ -246,7 +265,9 @@ class Plant:
     def __reduce__(self) -> tuple[Any, ...]:
         if self.origin is not None:
             return _rebuilt, tuple(self.origin)
-        return copyreg.__newobj__, (Plant,), {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}  # type: ignore[attr-defined]
+        state = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        state["kernels"] = Kernels(*(f if f is None else _Sent(f) for f in self.kernels))
+        return object.__new__, (Plant,), state
 
     def __eq__(self, other: object) -> bool:
         same = isinstance(other, Plant) and self.origin is not None and self.origin == other.origin
@@ -547,7 +568,7 @@ def load_plant(plant_id: str, **options: Any) -> Plant:
             not build the plant it is registered for.
     """
     sources = plant_sources()
-    if plant_id not in sources:
+    if not isinstance(plant_id, str) or plant_id not in sources:
         raise ValueError(unknown("plant", plant_id, sources))
     return _built(plant_id, sources[plant_id], options)
 
