@@ -68,7 +68,8 @@ class FaultMode(NamedTuple):
         bands: Sizes below the first are "small", below the second "medium", else "large".
         offset, direction, reach: The line that the fault spans in the estimated space, as a deviation from healthy:
             offset + m direction with m in reach. A stuck surface has offset -1 in its effectiveness, direction its
-            position. Two faults add their deviations.
+            position. Two faults add their deviations. A fault that is building up is on its way from healthy to there;
+            processes other than "standard" may draw one that stays short of the reach, none beyond it.
     """
 
     name: str
