@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fdi_gym.names import blame, check_diagnoser_name, find_function, unknown
 from fdi_gym.plant import Array, Plant, contiguous
 
 
@@ -102,16 +103,27 @@ def diagnoser(name: str, summary: str, *, clairvoyant: bool = False, **settings:
 
 
 @functools.cache
-def _import_packages() -> None:
+def broken_plugins() -> dict[str, str]:
+    """The modules of the entry-point group that cannot be imported, with the reason; the others are imported."""
+    broken = {}
+
+    def load(what: str, function: Callable[[], Any]) -> Any:
+        try:
+            return function()
+        except (Exception, SystemExit) as error:
+            broken[what] = blame(error)
+            return None
+
     for entry_point in entry_points(group="fdi_gym.diagnosers"):
-        place = entry_point.load()
-        for module in pkgutil.walk_packages(getattr(place, "__path__", []), place.__name__ + "."):
-            importlib.import_module(module.name)
+        place = load(entry_point.value, entry_point.load)
+        for module in pkgutil.walk_packages(getattr(place, "__path__", []), f"{entry_point.value}.", onerror=lambda _: None):
+            load(module.name, functools.partial(importlib.import_module, module.name))
+    return broken
 
 
 def diagnosers() -> dict[str, Entry]:
     """All diagnosers by name, in the order in which their modules declare them."""
-    _import_packages()
+    broken_plugins()  # imports the modules in which they are
     return dict(_entries)
 
 
@@ -122,15 +134,17 @@ def find_diagnoser(name: str) -> Entry:
         ValueError: There is none; the message lists those that exist.
     """
     if ":" in name:
-        module, function = name.split(":", 1)
+        build = find_function("diagnoser", check_diagnoser_name(name))
         try:
-            build = getattr(importlib.import_module(module), function)
-        except (ImportError, AttributeError) as error:
-            raise ValueError(f"no diagnoser {name!r}: {error}") from error
+            arguments = inspect.signature(build).parameters
+        except (ValueError, TypeError):  # a builtin
+            arguments = {}
+        if not arguments:
+            raise ValueError(f"{name} is no builder of a diagnoser: it takes no plant")
         return Entry(name, (inspect.getdoc(build) or name).splitlines()[0], build, {}, False)
     found = diagnosers()
     if name not in found:
-        raise ValueError(f"unknown diagnoser {name!r}; there are {', '.join(found)}")
+        raise unknown("diagnoser", name, found)
     return found[name]
 
 
@@ -155,7 +169,15 @@ def make_diagnoser(name: str, plant: Plant, *, scenarios: Sequence[Any] | None =
     known = {"scenarios": scenarios} if entry.clairvoyant else {}
     if entry.clairvoyant and scenarios is None:
         raise ValueError(f"{name} knows the truth: it needs scenarios, one per episode")
-    return guarded(entry.build(plant, **settings, **known), plant)
+    try:
+        built = entry.build(plant, **settings, **known)
+    except ValueError:
+        raise
+    except Exception as error:
+        raise ValueError(f"the builder of {name} failed: {blame(error)}") from error
+    if not isinstance(built, Diagnoser):
+        raise ValueError(f"the builder of {name} gives {type(built).__name__}, not a Diagnoser")
+    return guarded(built, plant)
 
 
 def told(name: str, process: str) -> dict[str, str]:

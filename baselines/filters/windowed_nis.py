@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
 from fdi_gym.estimation.kalman import times
@@ -59,7 +59,7 @@ def windowed_nis(plant: Plant, *, window: int = 50, confidence: float = 0.9999, 
         NotApplicableError: The plant is nonlinear.
     """
     nominal = steady_filter(plant)
-    limit = chi2.ppf(confidence, window * len(plant.outputs))
+    limit = chdtri(window * len(plant.outputs), 1 - confidence)  # chi-square quantile
     trim = plant.trim_state
 
     def init(n: int) -> Any:
