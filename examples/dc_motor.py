@@ -18,12 +18,13 @@ from msgspec import Meta
 
 import fdi_gym
 from fdi_gym.diagnosis import diagnosers
-from fdi_gym.evaluation import Suite, applicable, evaluate
+from fdi_gym.evaluation import applicable, evaluate
 from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Incipient, Scoring
 from fdi_gym.kernels import kernel
 from fdi_gym.leaderboard import table
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
 from fdi_gym.shapes import Shapes
+from fdi_gym.suite import Suite
 
 ID, VERSION = "DCMotor", 0
 
@@ -140,13 +141,13 @@ ENV = fdi_gym.register_plant(ID, f"{__name__}:plant")
 
 def main() -> None:
     suite = Suite(
-        name="dc-motor", description="a DC motor", env=ENV, plant=ID, options={}, scenario="standard", mismatch=None,
+        name="dc-motor", description="a DC motor", env=ENV, plant=ID, options={}, process="standard", mismatch=None,
         first_seed=1_000_000, episodes=20, settings={},
     ).sealed()  # fmt: skip
     names, _ = applicable(suite, suite.build(), list(diagnosers()))
     with tempfile.TemporaryDirectory() as work:
-        rows, timing = evaluate(suite, names, work=Path(work), jobs=1)
-    print(table(list(rows.values()), timing))
+        found = evaluate(suite, names, work=Path(work), jobs=1)
+    print(table([f.row for f in found.values()], {name: f.made.microseconds for name, f in found.items()}))
 
 
 if __name__ == "__main__":

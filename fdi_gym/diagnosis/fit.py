@@ -334,9 +334,7 @@ def _on_disk(entry: Entry, place: str, of: Any, make: Any) -> Any:
     return found
 
 
-def knowledge_of(
-    entry: Entry, plant: Plant, process: str, settings: Mapping[str, Any], scenarios: Any = None
-) -> dict[str, Any]:
+def knowledge_of(entry: Entry, plant: Plant, process: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The belief and the calibration that a method's builder takes: shipped, or found now and kept for the session."""
     found: dict[str, Any] = {}
     if entry.takes("belief"):
