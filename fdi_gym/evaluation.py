@@ -87,7 +87,9 @@ def diagnose(suite: Suite, plant: Plant, name: str, episodes: Sequence[int], rec
     scenarios = suite.scenarios(plant, episodes)
     record = simulate(plant, scenarios) if record is None else record
     with blamed(name):
-        diagnoser = make_diagnoser(name, plant, process=suite.process, scenarios=scenarios, **settings_of(suite, plant, name))
+        diagnoser = make_diagnoser(
+            name, plant, process=suite.process, scenarios=scenarios, **settings_of(suite, plant, name)
+        )
         diagnoser.update(diagnoser.init(len(scenarios)), record.obs[:, 0])  # what is done once is not timed
         start = time.process_time()
         said = run(diagnoser, record.obs)

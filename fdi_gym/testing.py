@@ -366,7 +366,9 @@ def _check_gaps(diagnoser: Diagnoser, plant: Plant, scenarios: Sequence[FaultSce
     right, right_hurt = ((d.label == truth).mean() for d in (said, hurt))
     assert right_hurt >= right - 0.15, f"gaps cost accuracy: {right:.2f} without, {right_hurt:.2f} with"
     alarms, alarms_hurt = ((d.alarm & (truth == 0)).mean() for d in (said, hurt))
-    assert alarms_hurt <= alarms + 0.05, f"gaps raise false alarms: {alarms:.3f} of the samples without, {alarms_hurt:.3f} with"
+    assert alarms_hurt <= alarms + 0.05, (
+        f"gaps raise false alarms: {alarms:.3f} of the samples without, {alarms_hurt:.3f} with"
+    )
 
 
 def _arrays(said: Decisions) -> dict[str, Array]:

@@ -18,10 +18,6 @@ from fdi_gym.estimation.kalman import T, symmetric
 from fdi_gym.plant import Array, Plant
 
 
-
-
-
-
 class Propagated(NamedTuple):
     """What a rule gives. The Jacobian with respect to the state is A = D S^-1."""
 

@@ -164,9 +164,7 @@ def switching_bayes_bank(
         if not h:
             return s
         M, G, g = s.M.copy(), s.G.copy(), s.g.copy()
-        M[:, :h], G[:, :h], g[:, :h] = sense(
-            f, s.healthy, M[:, :h], G[:, :h], g[:, :h], E[:, None] * ~gone[:, None, None]
-        )
+        M[:, :h], G[:, :h], g[:, :h] = sense(f, s.healthy, M[:, :h], G[:, :h], g[:, :h], E[:, None] * ~gone[:, None, None])
         s = s._replace(M=M, G=G, g=g)
         if k % GRID:
             return s

@@ -33,9 +33,7 @@ class Told(NamedTuple):
 
 
 @diagnoser("told_onset_ekf", "Augmented EKF, told when the label changes; for any plant", clairvoyant=True)
-def told_onset_ekf(
-    plant: Plant, belief: Belief, *, scenarios: Sequence[FaultScenario], walk: float = 0.3
-) -> Diagnoser:
+def told_onset_ekf(plant: Plant, belief: Belief, *, scenarios: Sequence[FaultScenario], walk: float = 0.3) -> Diagnoser:
     """The oracle.
 
     Args:

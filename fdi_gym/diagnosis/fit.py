@@ -338,9 +338,7 @@ def knowledge_of(entry: Entry, plant: Plant, process: str, settings: Mapping[str
     """The belief and the calibration that a method's builder takes: shipped, or found now and kept for the session."""
     found: dict[str, Any] = {}
     if entry.takes("belief"):
-        found["belief"] = _known(
-            entry, plant, "beliefs", belief_key(plant, process), lambda: fit_belief(plant, process)
-        )
+        found["belief"] = _known(entry, plant, "beliefs", belief_key(plant, process), lambda: fit_belief(plant, process))
     if entry.takes("calibration"):
         key = calibration_key(entry, plant, process, settings)
         found["calibration"] = _known(
