@@ -154,8 +154,6 @@ class Plant:
             its two ends. None where nothing is known of it.
         monitor: Maps states (..., n_x) to named quantities (...) that `info` reports beside the truth, such as the distance
             to a singularity; diagnosers never see them.
-        tuning: Settings of diagnosers, by name, that suit this plant better than what they find for themselves, such as
-            those of its paper; what a caller gives overrides them.
         noise: Draws (w (steps, n_x), v (steps + 1, n_y)) from a Generator. Default: white, row by row, v before w.
         isolation_reward: (labels, labels): reward of declaring column while row is true. Default: 1 if right, else 0.
         identification_reward: Reward of an error (..., n). Default: minus the squares, scaled.
@@ -189,7 +187,6 @@ class Plant:
     disturbance: Callable[[FaultScenario], Array] | None = None
     measured_disturbance: Callable[[float, Array, Array], Array] | None = None
     monitor: Callable[[Array], Mapping[str, Array]] = _nothing
-    tuning: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     noise: Callable[[np.random.Generator, int], tuple[Array, Array]] | None = None
     isolation_reward: Array | None = None
     identification_reward: Callable[[Array], Array] | None = None

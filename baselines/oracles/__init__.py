@@ -1,0 +1,1 @@
+"""Ceilings: methods that know part of the truth, and say so."""
