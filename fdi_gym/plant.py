@@ -212,8 +212,6 @@ class Plant:
         shapes: What the three dicts of a scenario may hold; what does not fit is refused before it flies.
         monitor: Maps states (..., n_x) to named quantities (...) that `info` reports beside the truth, such as the distance
             to a singularity; diagnosers never see them.
-        tuning: Settings of diagnosers, by name, that suit this plant better than what they find for themselves, such as
-            those of its paper; what a caller gives overrides them.
         noise: Draws (w (steps, n_x), v (steps + 1, n_y)) from a Generator. Default: white, row by row, v before w.
         isolation_reward: (labels, labels): reward of declaring column while row is true. Default: 1 if right, else 0.
         identification_reward: Reward of an error (..., n). Default: minus the squares, scaled.
@@ -248,7 +246,6 @@ class Plant:
     measured_disturbance: Callable[[float, Array, Array], Array] | None = None
     monitor: Callable[[Array], Mapping[str, Array]] = _nothing
     shapes: Shapes = OPEN
-    tuning: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     noise: Callable[[np.random.Generator, int], tuple[Array, Array]] | None = None
     isolation_reward: Array | None = None
     identification_reward: Callable[[Array], Array] | None = None

@@ -86,7 +86,7 @@ def _step(plant: Plant, filter: Filter, rule: Rule, s: Running, obs: Array) -> t
     elif measures.any():
         state = choose(measures, filter.update(state, at, y, seen), state)
     reading = filter.read(state)
-    informed = measures if whole else measures & seen.any(axis=1)
+    informed = measures if whole else measures & (seen.any(axis=1) if reading.seen is None else reading.seen > 0)
     ruled, verdict = rule.step(s.rule, s.k, reading, informed)
     return Running(s.k + 1, begun, u, known, state, ruled), reading, verdict
 
@@ -100,7 +100,8 @@ def diagnoser_of(plant: Plant, filter: Filter, rule: Rule) -> Diagnoser:
         z = r.z if verdict.z is None else verdict.z
         std = None if r.P is None else np.sqrt(np.maximum(np.einsum("npp->np", r.P), 0.0))
         estimate = None if z is None else healthy + z
-        return s, Diagnosis(verdict.alarm, verdict.label, estimate, std, r.probs, r.x, r.signals)
+        signals = {**(r.signals or {}), **(verdict.signals or {})}
+        return s, Diagnosis(verdict.alarm, verdict.label, estimate, std, r.probs, r.x, signals or None)
 
     return Diagnoser(lambda n: _start(plant, filter, rule, n), update, gaps=True, filter=filter, rule=rule)
 

@@ -72,9 +72,6 @@ STATES = ("u", "v", "w", "p", "q", "r", "phi", "theta", "psi", "a1f", "b1f")
 U_MIN = (-0.02, -0.12, -0.12, -0.20)  # rad: command limits
 U_MAX = (0.20, 0.12, 0.12, 0.25)
 SIGMA_V = (0.05, 0.05, 0.05, 0.005, 0.005, 0.005, 0.009, 0.009, 0.009)  # m/s, rad/s, rad: sensors
-# What the paper's filters believe: initial velocities, rates and attitude, flapping; then fault [rad] and gust [m/s]
-X0_STD = (0.1, 0.1, 0.1, 0.02, 0.02, 0.02, 0.02, 0.02, 0.02, 0.005, 0.005)
-WALKS = {"b0_std": 2e-3, "d0_std": 0.5, "b_step": 7e-4, "d_step": 0.05}
 # Beyond anything that a flight can reach before it ends; psi is not wrapped
 SENSOR_RANGE = (100.0, 100.0, 100.0, 50.0, 50.0, 50.0, np.pi, np.pi, 1000.0)  # m/s, rad/s, rad
 SIGMA_W = (*(0.004,) * 3, *(0.005,) * 3, *(2e-4,) * 5)  # m/s, rad/s, rad, rad (flapping) per step: process
@@ -551,11 +548,6 @@ def plant(*, kappa: float = 0.3, K_B: float = 0.84) -> Plant:
         labels=labels, processes=_processes(),
         c0=np.concatenate([np.zeros(4), x_trim[9:]]),
         q=np.concatenate([K.ravel(), u_trim, x_trim, [p[5], np.exp(-DT / TAU_F)]]),
-        tuning={
-            **{name: {"x0_std": X0_STD, **WALKS} for name in ("three_stage_cdkf", "three_stage_ekf", "ascdkf")},
-            **{name: {"x0_std": X0_STD}
-               for name in ("robust_three_stage_cdkf", "robust_three_stage_ekf", "hypothesis_bank")},
-        },
         physical=physical, perturb=perturb, shapes=Shapes(Nothing, Gusts, Physical),
         noise=prescribed_noise, isolation_reward=np.eye(len(labels)) - 0.5 * wrongly,
         identification_reward=identification_reward,
