@@ -46,6 +46,7 @@ class Signal(NamedTuple):
         scale: Typical size, by which learners divide.
         sigma: Standard deviation of its white noise: per sample of a sensor, per step of a state. 0 for others.
         nominal: Trim value of a command or state, healthy value of a fault parameter.
+        period: Of an angle that is known up to whole turns: a turn in its unit. 0 for others.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Signal(NamedTuple):
     scale: float = 1.0
     sigma: float = 0.0
     nominal: float = 0.0
+    period: float = 0.0
 
 
 class FaultMode(NamedTuple):
@@ -154,6 +156,8 @@ class Plant:
             its two ends. None where nothing is known of it.
         monitor: Maps states (..., n_x) to named quantities (...) that `info` reports beside the truth, such as the distance
             to a singularity; diagnosers never see them.
+        quaternions: Outputs that are a quaternion known up to its sign: the positions of its vector part (3) and of the
+            sign of its scalar part, for each.
         tuning: Settings of diagnosers, by name, that suit this plant better than what they find for themselves, such as
             those of its paper; what a caller gives overrides them.
         noise: Draws (w (steps, n_x), v (steps + 1, n_y)) from a Generator. Default: white, row by row, v before w.
@@ -189,6 +193,7 @@ class Plant:
     disturbance: Callable[[FaultScenario], Array] | None = None
     measured_disturbance: Callable[[float, Array, Array], Array] | None = None
     monitor: Callable[[Array], Mapping[str, Array]] = _nothing
+    quaternions: tuple[tuple[int, int, int, int], ...] = ()
     tuning: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     noise: Callable[[np.random.Generator, int], tuple[Array, Array]] | None = None
     isolation_reward: Array | None = None
@@ -241,6 +246,11 @@ class Plant:
     def trim_state(self) -> Array:
         """The initial state where a scenario gives none (n_x,)."""
         return np.array([s.nominal for s in self.states])
+
+    @functools.cached_property
+    def periods(self) -> Array:
+        """The turn of each output that is an angle known up to whole turns, 0 for others (n_y,)."""
+        return np.array([s.period for s in self.outputs])
 
     def split(self, obs: Array) -> tuple[Array, Array, Array]:
         """An observation (..., n_obs) as (y, u of the interval that has just ended, known)."""
