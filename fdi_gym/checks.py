@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -102,9 +102,6 @@ def _wrong(plant: Plant) -> Iterable[str]:
     reward, n = np.asarray(plant.isolation_reward), len(plant.labels)
     if reward.shape != (n, n) or reward.dtype.kind not in "iufb" or not np.isfinite(reward).all():
         yield f"isolation_reward holds finite numbers in the shape ({n}, {n}), not {plant.isolation_reward!r}"
-    for name, settings in plant.tuning.items():
-        if not isinstance(name, str) or not isinstance(settings, Mapping) or not all(isinstance(k, str) for k in settings):
-            yield f"tuning maps a diagnoser's name to its settings by name, not {name!r} to {settings!r}"
 
 
 def twice(what: str, names: Sequence[Any]) -> Iterable[str]:

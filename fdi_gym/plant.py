@@ -51,6 +51,7 @@ class Signal(NamedTuple):
         scale: Typical size, by which learners divide.
         sigma: Standard deviation of its white noise: per sample of a sensor, per step of a state. 0 for others.
         nominal: Trim value of a command or state, healthy value of a fault parameter.
+        period: Of an angle that is known up to whole turns: a turn in its unit. 0 for others.
     """
 
     name: str
@@ -60,6 +61,7 @@ class Signal(NamedTuple):
     scale: float = 1.0
     sigma: float = 0.0
     nominal: float = 0.0
+    period: float = 0.0
 
 
 class FaultMode(NamedTuple):
@@ -212,6 +214,8 @@ class Plant:
         shapes: What the three dicts of a scenario may hold; what does not fit is refused before it flies.
         monitor: Maps states (..., n_x) to named quantities (...) that `info` reports beside the truth, such as the distance
             to a singularity; diagnosers never see them.
+        quaternions: Outputs that are a quaternion known up to its sign: the positions of its vector part (3) and of the
+            sign of its scalar part, for each.
         noise: Draws (w (steps, n_x), v (steps + 1, n_y)) from a Generator. Default: white, row by row, v before w.
         isolation_reward: (labels, labels): reward of declaring column while row is true. Default: 1 if right, else 0.
         identification_reward: Reward of an error (..., n). Default: minus the squares, scaled.
@@ -246,6 +250,7 @@ class Plant:
     measured_disturbance: Callable[[float, Array, Array], Array] | None = None
     monitor: Callable[[Array], Mapping[str, Array]] = _nothing
     shapes: Shapes = OPEN
+    quaternions: tuple[tuple[int, int, int, int], ...] = ()
     noise: Callable[[np.random.Generator, int], tuple[Array, Array]] | None = None
     isolation_reward: Array | None = None
     identification_reward: Callable[[Array], Array] | None = None
@@ -309,6 +314,11 @@ class Plant:
     def trim_state(self) -> Array:
         """The initial state where a scenario gives none (n_x,)."""
         return np.array([s.nominal for s in self.states])
+
+    @functools.cached_property
+    def periods(self) -> Array:
+        """The turn of each output that is an angle known up to whole turns, 0 for others (n_y,)."""
+        return np.array([s.period for s in self.outputs])
 
     def split(self, obs: Array) -> tuple[Array, Array, Array]:
         """An observation (..., n_obs) as (y, u of the interval that has just ended, known)."""

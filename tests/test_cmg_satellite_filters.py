@@ -1,12 +1,17 @@
-"""Filters of the CMG satellite: check values of the data sheet, identities, batches, and what the methods can do."""
+"""Filters of the CMG satellite: check values of the data sheet, identities, gaps, batches, and what the methods can do."""
 
 import numpy as np
 import pytest
 
-from baselines.filters.joint_ukf import step
+from baselines.filters.attitude import rotated
+from baselines.filters.covariance_adaptation import Trial, binary_grid, element_grid, repeated
+from baselines.filters.covariance_adaptive_ukf import EVEN, ODD, all_subsets, alternating
+from baselines.filters.joint_ukf import Attitude, corrected, predicted, statistic
+from baselines.filters.mekf import observation, transition
+from baselines.oracles.cramer_rao_oracle import cramer_rao_oracle, log_evidence
+from baselines.oracles.mekf_clairvoyant import changes
 from fdi_gym.diagnosis import NotApplicableError, make_diagnoser, run
-from fdi_gym.estimation.covariance_adaptation import Trial, binary_grid, element_grid
-from fdi_gym.estimation.unscented import covariance, mean_and_deviations, sigma_points, weights
+from fdi_gym.estimation.sigma_points import cholesky, covariance, mean_and_deviations, unscented_points, weights
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
@@ -27,15 +32,16 @@ def plant():
 
 @pytest.fixture(scope="module")
 def one_step(plant):
-    """The data sheet's step: (run from a covariance) -> Step and the residual v."""
+    """The data sheet's step: (run from a covariance) -> what is predicted, what is corrected, b and the residual v."""
     x = np.array([[*Q_V, *W, *DELTA, 1.0, 0.9, 0.8, 1.0]])
     truth = plant.propagate(0.0, np.array([*Q_V, np.sqrt(0.86), *W, *DELTA]), R_K, np.array([[0.5, 1.0, 0.9, 0.7]]))
     y = np.delete(truth, 3)[None] + 1e-4 * np.array([1, -1, 1, 2, -2, 1, 0.5, -0.5, 1, -1])
-    Q, R, sign = 1e-10 * np.eye(14), 1e-8 * np.eye(10), np.ones(1)
+    Q, R, seen = 1e-10 * np.eye(14), 1e-8 * np.eye(10), np.ones((1, 10), bool)
 
     def from_covariance(P):
-        found = step(plant, Q, R, x, P[None], y, sign, R_K)
-        return found, ((y - found.x[:, :10])[:, :6] ** 2).sum() / 1e-8
+        ahead = predicted(plant, Q, Attitude(x, P[None], np.ones(1)), R_K)
+        found = corrected(R, ahead, y, seen)
+        return ahead, found, statistic(found.nu, found.S, seen), ((y - found.x[:, :10])[:, :6] ** 2).sum() / 1e-8
 
     return from_covariance
 
@@ -48,8 +54,8 @@ def close(value, expected, rtol=1e-9):
 
 
 def test_joint_step(one_step):
-    s, v = one_step(P_START)
-    close(s.predicted[0, :6], [1.0023514331e-01, -2.0003306695e-01, 3.0017406752e-01,
+    ahead, s, b, v = one_step(P_START)
+    close(ahead.x[0, :6], [1.0023514331e-01, -2.0003306695e-01, 3.0017406752e-01,
                                5.0735890220e-02, -2.0626679277e-02, 2.7742322260e-02])  # fmt: skip
     close(s.x[0, :10], [1.0028348512e-01, -2.0008528925e-01, 3.0022593863e-01, 5.0105300672e-02, -2.1117573131e-02,
                         2.8587892247e-02, 3.0202502116e-01, -2.0102514662e-01, 5.0155029098e-01,
@@ -59,7 +65,7 @@ def test_joint_step(one_step):
     close(P[:6], [5.0247718146e-09, 5.0247970321e-09, 5.0246726375e-09, 7.4710045622e-09, 6.6594902646e-09,
                   8.3388948536e-09])  # fmt: skip
     close(P[10:], [3.6148252478e-03, 7.9284229354e-03, 4.3013698774e-03, 9.2947347159e-03])
-    close(s.b, [2.4396910357e01])
+    close(b, [2.4396910357e01])
     close(v, 3.9431104181e00)
 
 
@@ -71,7 +77,7 @@ def test_joint_step(one_step):
 def test_candidates(one_step, units, v, theta):
     P = P_START.copy()
     P[[10 + i for i in units], [10 + i for i in units]] += 1e-2
-    found, residual = one_step(P)
+    _, found, _, residual = one_step(P)
     close(residual, v)
     close(found.x[0, 10:], theta)
 
@@ -110,21 +116,9 @@ def test_sequence_flight(sequence):
     close(sequence.obs[0, 450, 11:15], [-1.2791427454e-02, 6.4104329035e-03, 7.3960649493e-03, -1.0834219437e-02], 1e-8)
 
 
-def states(name, plant, obs, **tuning):
-    """The filter's own state after each sample."""
-    from fdi_gym.diagnosis import find_diagnoser
-
-    entry = find_diagnoser(name)
-    raw = entry.build(plant, **{**entry.settings, **tuning})
-    s, found = raw.init(len(obs)), []
-    for k in range(obs.shape[1]):
-        s, _ = raw.update(s, obs[:, k])
-        found.append(s)
-    return found
-
-
-def theta(s):
-    return s.f[0] if hasattr(s, "f") else s.x[0, 10:]
+def told(name, plant, obs, **tuning):
+    """What a method says, and its signals."""
+    return run(make_diagnoser(name, plant, **tuning), obs, signals=True)
 
 
 @pytest.mark.parametrize(("name", "expected", "beta", "adapted", "first"), [
@@ -137,29 +131,29 @@ def theta(s):
     ("dual_sgaukf", [0.98761064500, 0.98671309791, 1.0081376783, 0.97366615905], 15.715958367, 56, 382),
 ])  # fmt: skip
 def test_sequence_of_unscented_filters(plant, sequence, name, expected, beta, adapted, first):
-    found = states(name, plant, sequence.obs)
-    close(theta(found[450]), expected, 1e-8)
-    close(found[450].beta, [beta], 1e-8)
-    assert found[450].adapted[0] == adapted
+    found = told(name, plant, sequence.obs)
+    close(found.estimate[0, 450], expected, 1e-8)
+    close(found.signals["statistic"][0, 450], beta, 1e-8)
+    assert found.signals["adapted"][0, 450] == adapted
+    up = np.flatnonzero(found.signals["flag"][0])
     if first is not None:
-        up = [k for k, s in enumerate(found) if s.beta[0] > 9.0 and k > 51]
         assert up[0] == first
     if name == "joint_ukf":
         assert len(up) == 39
     dual = name.startswith("dual")
-    close(found[300].beta, [5.3630330521 if dual else 5.3629343137], 1e-8)
-    close(theta(found[300]), [1.0002270876, 0.99991369366, 0.99982981812, 1.0003164528] if dual
+    close(found.signals["statistic"][0, 300], 5.3630330521 if dual else 5.3629343137, 1e-8)
+    close(found.estimate[0, 300], [1.0002270876, 0.99991369366, 0.99982981812, 1.0003164528] if dual
           else [1.0009143339, 0.99850089273, 0.99895047955, 1.0013206112], 1e-8)  # fmt: skip
 
 
 def test_sequence_of_mekf(plant, sequence):
-    found = states("mekf", plant, sequence.obs)
-    close(theta(found[450]), [1.1231160411, 0.62633430046, 0.82328160960, 0.53756170088], 1e-8)
-    close(found[450].nis, [6.1078305276], 1e-8)
-    resets = [k for k in range(1, 451) if found[k].resets[0] > found[k - 1].resets[0]]
-    assert resets == [422]
-    close(theta(found[300]), [1.0008497852, 0.99844368573, 0.99893276833, 1.0009396505], 1e-8)
-    close(found[300].nis, [5.5623058820], 1e-8)
+    found = told("mekf", plant, sequence.obs)
+    close(found.estimate[0, 450], [1.1231160411, 0.62633430046, 0.82328160960, 0.53756170088], 1e-8)
+    close(found.signals["statistic"][0, 450], 6.1078305276, 1e-8)
+    assert np.flatnonzero(np.diff(found.signals["resets"][0], prepend=0)).tolist() == [422]
+    assert np.flatnonzero(found.signals["flag"][0]).tolist() == [422]
+    close(found.estimate[0, 300], [1.0008497852, 0.99844368573, 0.99893276833, 1.0009396505], 1e-8)
+    close(found.signals["statistic"][0, 300], 5.5623058820, 1e-8)
 
 
 # -- identities
@@ -169,15 +163,13 @@ def test_unscented_transform_is_exact_for_linear_maps():
     rng = np.random.default_rng(0)
     x, B = rng.standard_normal((3, 5)), rng.standard_normal((3, 5, 5))
     P, A = B @ np.swapaxes(B, 1, 2), rng.standard_normal((4, 5))
-    points = sigma_points(x, P)
+    points = unscented_points(x, P)
     mean, dev = mean_and_deviations(points @ A.T, weights(5))
     np.testing.assert_allclose(mean, x @ A.T, atol=1e-13)
     np.testing.assert_allclose(covariance(dev, dev, weights(5)), A @ P @ A.T, atol=1e-12)
 
 
 def test_cholesky_jitter_is_only_for_the_matrix_that_needs_it():
-    from fdi_gym.estimation.unscented import cholesky
-
     good, flat = np.diag([2.0, 3.0]), np.array([[1.0, 1.0], [1.0, 1.0 - 1e-13]])
     L = cholesky(np.stack([good, flat, -np.eye(2)]))
     np.testing.assert_array_equal(L[0], np.linalg.cholesky(good))
@@ -198,8 +190,6 @@ def scripted(scores):
 
 
 def test_binary_grid_takes_the_first_best_candidate_and_caps():
-    from baselines.filters.gaukf import all_subsets
-
     search = binary_grid(np.arange(4), 0.1, all_subsets)
     P = np.tile(np.diag([0.2, 0.01, 0.01, 0.01]), (2, 1, 1))
     go, asked = scripted(lambda r, p: 0.0 if p[1, 1] > 0.05 or r == 1 else 1.0)
@@ -212,12 +202,22 @@ def test_binary_grid_takes_the_first_best_candidate_and_caps():
 
 
 def test_simplified_grid_alternates():
-    from baselines.filters import sgaukf
+    assert ODD[:, [0, 2]].tolist() == [[False, False], [True, False], [False, True], [True, True]]
+    assert not ODD[:, [1, 3]].any()
+    assert EVEN[:, [1, 3]].tolist() == ODD[:, [0, 2]].tolist()
+    assert not EVEN[:, [0, 2]].any()
+    np.testing.assert_array_equal(alternating(np.array([0, 1, 2])), [ODD, EVEN, ODD])
 
-    assert sgaukf.ODD[:, [0, 2]].tolist() == [[False, False], [True, False], [False, True], [True, True]]
-    assert not sgaukf.ODD[:, [1, 3]].any()
-    assert sgaukf.EVEN[:, [1, 3]].tolist() == sgaukf.ODD[:, [0, 2]].tolist()
-    assert not sgaukf.EVEN[:, [0, 2]].any()
+
+def test_passes_stop_where_the_residual_is_small():
+    """Each pass goes on from the covariance that the one before kept; an episode that is done keeps what it has."""
+    search = binary_grid(np.arange(1), 0.1, lambda count: np.tile([[True]], (len(count), 1, 1)))
+    go, asked = scripted(lambda r, p: 0.0 if r == 0 else 1.0)
+    kept = repeated(search, 3)(np.full((2, 1, 1), 0.01), np.zeros(2, int), go)
+    assert len(asked) == 3
+    np.testing.assert_allclose(kept.base[:, 0, 0], [0.11, 0.25])  # 0.01 + 0.1; 0.01 + 0.3, capped
+    with pytest.raises(ValueError, match="1 pass"):
+        repeated(search, 0)
 
 
 def test_element_grid_skips_what_is_not_a_covariance():
@@ -248,9 +248,6 @@ def test_an_episode_is_the_same_alone_and_in_a_batch(plant, name):
 
 
 def test_mekf_jacobian_is_the_derivative_of_the_step():
-    from baselines.filters.mekf import transition
-    from fdi_gym.estimation.attitude import rotated
-
     for fault_model in ("torque", "wheel"):
         plant = load_plant("CMGSatellite", fault_model=fault_model)
         q, w, d = np.array([[*Q_V, np.sqrt(0.86)]]), np.array([W]), np.array([DELTA])
@@ -272,9 +269,6 @@ def test_mekf_jacobian_is_the_derivative_of_the_step():
 
 
 def test_mekf_observation_is_the_derivative_of_the_measurement():
-    from baselines.filters.mekf import observation
-    from fdi_gym.estimation.attitude import rotated
-
     q = np.array([[*Q_V, -np.sqrt(0.86)]])
     for j in range(3):
         t = 1e-6 * np.eye(3)[j : j + 1]
@@ -286,8 +280,6 @@ def test_mekf_observation_is_the_derivative_of_the_measurement():
 
 
 def test_clairvoyant_resets_at_the_changes(plant):
-    from baselines.filters.mekf import changes
-
     rows = changes(plant, [cmg.table4("slew"), FaultScenario(plant=cmg.ID, steps=100)])
     assert np.flatnonzero(rows[0]).tolist() == [2000, 4000, 7000, 10000, 15000]
     assert not rows[1].any()
@@ -313,15 +305,15 @@ def test_other_plants_are_refused():
         make_diagnoser("mekf", load_plant("B747Lateral"))
 
 
-def test_a_wrong_form_is_named(plant):
+def test_a_wrong_form_or_grid_is_named(plant):
     with pytest.raises(ValueError, match="joint"):
         make_diagnoser("gaukf", plant, form="triple")
+    with pytest.raises(ValueError, match="alternating"):
+        make_diagnoser("gaukf", plant, grid="even")
 
 
 def test_oracle_classifier_integrates_to_a_density(plant):
     """Each label's evidence is a density of f_hat: for two units against the integral over the severities."""
-    from baselines.filters.cramer_rao_oracle import log_evidence
-
     rng = np.random.default_rng(2)
     B = 0.05 * rng.standard_normal((4, 4))
     P, f_hat = B @ B.T + 0.01 * np.eye(4), np.array([0.7, 1.02, 0.95, 0.6])
@@ -337,8 +329,6 @@ def test_oracle_classifier_integrates_to_a_density(plant):
 
 def test_bound_on_the_slew(plant):
     """Healthy slew at 45 dB, change at 40 s: sd 0.039-0.049, 0.0100-0.0102, 0.0038-0.0039 after 1, 3, 10 s."""
-    from baselines.filters.cramer_rao_oracle import cramer_rao_oracle
-
     faults = [cmg.loss(0, 1e-9, 4000, 6000)]
     scenario = FaultScenario(plant=cmg.ID, steps=5001, faults=faults, noise_seed=3)
     oracle = cramer_rao_oracle(plant, scenarios=[scenario])

@@ -13,7 +13,6 @@ from scipy.stats import betabinom
 from baselines.filters import augmented_kf, two_stage_kf
 from baselines.filters.augmented_gaussian import gaussian_filter
 from fdi_gym.diagnosis import NotApplicableError, diagnosers, fit, make_diagnoser, run
-from fdi_gym.diagnosis import fit as fitting
 from fdi_gym.diagnosis.fit import VALIDATION_SEED, fit_belief, flights_of, long_run
 from fdi_gym.estimation.augmented import Interval, augmented
 from fdi_gym.estimation.belief import Belief

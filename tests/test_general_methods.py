@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from baselines.filters.sgaukf import sgaukf
 from conftest import build, readings, states
 from scipy.stats import multivariate_normal
 from test_general_filters import belief_of, interval, model_of
@@ -11,7 +12,6 @@ from baselines.filters import multiple_model
 from baselines.filters.adaptive_ukf import WALK, adaptive_filter, every_subset
 from baselines.filters.augmented_gaussian import gaussian_filter
 from baselines.filters.joint_ukf import joint_ukf
-from baselines.filters.sgaukf import sgaukf
 from baselines.filters.two_stage_ekf import two_stage_filter
 from baselines.filters.two_stage_kf import aging
 from baselines.filters.two_stage_kf import two_stage_filter as papers_two_stage

@@ -104,7 +104,10 @@ def adaptive_filter(model: AugmentedModel, size: Array, grid: str) -> Filter:
             after = after._replace(X=X, P=P)
         return Adaptive(after, s.before, beta, updates, s.adapted + flag)
 
-    return Filter(start, predict, update, lambda s: reading_of(model, s.filter))
+    return Filter(
+        start, predict, update, lambda s: reading_of(model, s.filter),
+        expect=lambda s, at: model.expect(s.filter.X[:, model.x], at),
+    )  # fmt: skip
 
 
 @diagnoser("adaptive_ukf_full", "Augmented UKF, covariance adapted by binary grid search, for any plant", grid="full")

@@ -1,4 +1,4 @@
-"""Attitude in three numbers: the quaternion's vector part, whose scalar part follows from the unit norm and a sign."""
+"""What the satellite's filters share of attitudes: a quaternion in three numbers and a sign, and small rotations."""
 
 from __future__ import annotations
 
@@ -14,8 +14,13 @@ def require_attitude(plant: Plant) -> None:
     Raises:
         NotApplicableError: It does not.
     """
-    if len(plant.states) != 11 or [s.name for s in plant.outputs[-1:]] != ["sign q4"]:
+    if len(plant.states) != 11 or plant.quaternions != ((0, 1, 2, 10),):
         raise NotApplicableError(f"needs a measured quaternion, rate and gimbal angles; {plant.id} has none")
+
+
+def without_scalar(x: Array) -> tuple[Array, Array]:
+    """xi = (q1..q3, rest) and the sign of q4, from x = (q1..q4, rest) (..., m)."""
+    return np.delete(x, 3, axis=-1), np.where(x[..., 3] < 0.0, -1.0, 1.0)
 
 
 def with_scalar(xi: Array, sign: Array) -> Array:
@@ -26,6 +31,26 @@ def with_scalar(xi: Array, sign: Array) -> Array:
     rest = 1.0 - squares[..., 0] - squares[..., 1] - squares[..., 2]
     x[..., 3] = sign[:, None] * np.sqrt(np.maximum(rest, 0.0))
     return x
+
+
+def taken(x: Array, P: Array, y: Array, variance: Array, fresh: Array) -> tuple[Array, Array]:
+    """x (n, N) and P with the entries taken as measured that report for the first time: an update without a prior.
+
+    Args:
+        x: Mean (n, N), of which the measured entries come first.
+        P: Covariance (n, N, N).
+        y: Measurement (n, m).
+        variance: That it leaves (m,) or (n, m).
+        fresh: Which report for the first time (n, m) bool.
+    """
+    if not fresh.any():
+        return x, P
+    m, N = fresh.shape[1], x.shape[1]
+    x, now = x.copy(), np.zeros((len(x), N), bool)
+    x[:, :m], now[:, :m] = np.where(fresh, y, x[:, :m]), fresh
+    P = np.where(now[:, :, None] | now[:, None, :], 0.0, P)
+    P[:, range(m), range(m)] += np.where(fresh, variance, 0.0)
+    return x, P
 
 
 def cross(v: Array) -> Array:

@@ -10,11 +10,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from fdi_gym.estimation.missile_ekf import Filters
 
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
 from fdi_gym.estimation import missile_ekf as ekf
 from fdi_gym.estimation import missile_model as model
-from fdi_gym.estimation.missile_ekf import Filters
 from fdi_gym.plant import Array, Plant
 
 

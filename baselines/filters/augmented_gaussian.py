@@ -63,7 +63,10 @@ def gaussian_filter(model: AugmentedModel, rule: str, first_sample: bool = True)
         c = model.update(passes, s.X, s.P, at, y, seen)
         return Gaussian(c.x, c.P, c.nu, c.S, seen[:, model.sensors].sum(axis=1))
 
-    return Filter(start, predict, update, lambda s: reading_of(model, s), first_sample)
+    return Filter(
+        start, predict, update, lambda s: reading_of(model, s), first_sample,
+        expect=lambda s, at: model.expect(s.X[:, model.x], at),
+    )  # fmt: skip
 
 
 def reading_of(model: AugmentedModel, s: Gaussian) -> Reading:

@@ -13,7 +13,7 @@ Per onset: sensitivity of the filter's error M; information G = sum H' S^-1 H, g
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import log_ndtr, logsumexp

@@ -3,7 +3,8 @@
 At a step whose fault flag is up, the step is repeated from covariances with some elements raised, and the candidate
 that explains the measurement best is kept. A search asks for those steps through `run(rows, P) -> Trial`: `rows` (c,)
 says for which of the m flagged episodes, P (c, n_x, n_x) from which covariance; all candidates of all episodes that do
-not depend on each other go in one call."""
+not depend on each other go in one call.
+"""
 
 from __future__ import annotations
 
@@ -30,6 +31,25 @@ class Trial(NamedTuple):
     base: Array  # (m, n_x, n_x) the candidate covariance before the step
 
 
+class FaultFlag(NamedTuple):
+    """Exponentially weighted mean of an innovation statistic, and whether it says that there is a fault."""
+
+    beta: Array  # (n,)
+    samples: Array  # (n,) with an innovation so far
+    up: Array  # (n,) bool
+
+
+def unflagged(n: int) -> FaultFlag:
+    """The flag before any sample."""
+    return FaultFlag(np.zeros(n), np.zeros(n, np.int64), np.zeros(n, bool))
+
+
+def flagged(s: FaultFlag, b: Array, counts: Array, beta_0: float) -> FaultFlag:
+    """The flag after a sample with the statistic b (n,), in the episodes in which it counts (n,)."""
+    beta, samples = np.where(counts, s.beta + (b - s.beta) / MEMORY, s.beta), s.samples + counts
+    return FaultFlag(beta, samples, (beta > beta_0) & (samples > MEMORY + 1))
+
+
 Run = Callable[[Array, Array], Trial]
 Search = Callable[[Array, Array, Run], Trial]  # (P_base (m, n_x, n_x), adapted steps so far (m,), run) -> the kept ones
 
@@ -47,12 +67,22 @@ def _where(mask: Array, yes: Trial, no: Trial) -> Trial:
     return Trial(*(np.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(yes, no, strict=True)))
 
 
-def adapt(search: Search, P: Array, count: Array, run: Run, n_pass: int, eps_r: float) -> Trial:
-    """Passes of the search, each from the covariance that the one before kept, until the residual is below eps_r."""
-    trial = search(P, count, run)
-    for _ in range(n_pass - 1):
-        trial = _where(trial.v < eps_r, trial, search(trial.base, count, run))
-    return trial
+def repeated(search: Search, passes: int) -> Search:
+    """Passes of a search, each from the covariance that the one before kept, until the residual is below EPS_R.
+
+    Raises:
+        ValueError: No pass.
+    """
+    if passes < 1:
+        raise ValueError(f"a search needs at least 1 pass, not {passes}")
+
+    def again(P: Array, count: Array, run: Run) -> Trial:
+        trial = search(P, count, run)
+        for _ in range(passes - 1):
+            trial = _where(trial.v < EPS_R, trial, search(trial.base, count, run))
+        return trial
+
+    return again
 
 
 def binary_grid(entries: Array, inc: float | Array, choices: Callable[[Array], Array], cap: float | Array = CAP) -> Search:

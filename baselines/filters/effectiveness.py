@@ -1,12 +1,12 @@
-"""From estimates of effectiveness to a diagnosis: a unit is faulty where it has lost more than a threshold."""
+"""From estimates of effectiveness to a decision: a unit is faulty where it has lost more than a threshold."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-from fdi_gym.diagnosis import Diagnosis
+from fdi_gym.estimation.decision import Reading, Rule, Verdict, by_candidate
 from fdi_gym.plant import Array, Plant
 
 F_MIN, F_MAX = -1.0, 2.0  # estimates are kept in this range
@@ -14,10 +14,10 @@ P_THETA, Q_THETA = 1e-4, 1e-10  # variance of a healthy unit's effectiveness at 
 THRESHOLD = 0.05  # a unit that has lost more is called faulty
 
 
-def threshold_rule(plant: Plant, threshold: float) -> Callable[[Array, Array, Array], Diagnosis]:
-    """The rule (f (n, units), P (n, units, units), flag (n,)) -> Diagnosis: unit i is faulty where 1 - f_i > threshold.
+def threshold_rule(plant: Plant, threshold: float) -> Rule:
+    """Unit i is faulty where 1 - f_i > threshold, at once.
 
-    The alarm is up where the label says so, and before it does where the filter's own fault flag is.
+    The alarm is up where the label says so, and before it does where the filter's own signal "flag" is.
     """
     units = len(plant.theta)
     modes = [mode.name for mode in plant.modes]
@@ -26,8 +26,15 @@ def threshold_rule(plant: Plant, threshold: float) -> Callable[[Array, Array, Ar
     ])  # fmt: skip
     bits = 2 ** np.arange(units)
 
-    def decide(f: Array, P: Array, flag: Array) -> Diagnosis:
-        label = label_of[(1.0 - f > threshold) @ bits]
-        return Diagnosis((label > 0) | flag, label, f, np.sqrt(np.maximum(np.einsum("nii->ni", P), 0.0)))
+    def lost(r: Reading, label: Array) -> Array:
+        assert r.z is not None
+        return label_of[(-r.z > threshold) @ bits]
 
-    return decide
+    by_loss = by_candidate(lost, after=1)
+
+    def step(s: Any, k: Array, r: Reading, informed: Array) -> tuple[Any, Verdict]:
+        assert r.signals is not None
+        s, said = by_loss.step(s, k, r, informed)
+        return s, said._replace(alarm=said.alarm | r.signals["flag"])
+
+    return Rule(by_loss.start, step)

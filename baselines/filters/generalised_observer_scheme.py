@@ -15,12 +15,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from fdi_gym.estimation.missile_model import Sample
 
 from baselines.filters import approximation_detector as detection
 from baselines.filters.approximation_detector import B0, B1, A, Detector, G
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
 from fdi_gym.estimation import missile_model as model
-from fdi_gym.estimation.missile_model import Sample
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.missile_pitch import DEG, DT
 

@@ -154,7 +154,7 @@ def glr_filter(plant: Plant, model: AugmentedModel, size: Array, onsets: int, sp
         chosen = z[np.arange(n), np.argmin(cost, axis=1)]
         return Reading(chosen, None, s.X[:, x], s.P[:, x, x], s.nu, s.S, s.seen, cost)
 
-    return Filter(start, predict, update, read)
+    return Filter(start, predict, update, read, expect=lambda s, at: model.expect(s.X[:, model.x], at))
 
 
 @diagnoser("glr_ekf", "GLR test with propagated fault signatures on a healthy extended Kalman filter, for any plant")

@@ -15,12 +15,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from fdi_gym.estimation.missile_model import Sample
 from scipy.special import logsumexp
 
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
 from fdi_gym.estimation import missile_model as model
 from fdi_gym.estimation.kalman import T, symmetric, times
-from fdi_gym.estimation.missile_model import Sample
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.missile_pitch import DT

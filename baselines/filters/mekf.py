@@ -1,25 +1,27 @@
-"""Multiplicative extended Kalman filter with resets, and the same filter told when f changes.
+"""Multiplicative extended Kalman filter with resets.
 
 Error state (dtheta, dw, df), 10 numbers: the attitude error is a small rotation in body axes. Gimbal angles are dead-
 reckoned with the commanded rates and drawn towards the measured ones; only attitude and rate are filtered. Where the
 mean normalised innovation squared says that the model no longer holds, the covariance of f is opened and its
-correlations are forgotten. Clairvoyant, the resets come exactly at the changes of f, and there is no detector.
+correlations are forgotten. Attitude and rate have a wide prior until they are first reported, and are then taken as they
+are.
 
 F. L. Markley, J. Guidance, Control, and Dynamics 26(2), 2003 (multiplicative filter); resets and tuning: data sheet.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
-from fdi_gym.estimation.attitude import cross, require_attitude, rotated
-from fdi_gym.estimation.effectiveness import F_MAX, F_MIN, P_THETA, Q_THETA, THRESHOLD, threshold_rule
-from fdi_gym.estimation.kalman import T, symmetric, times
-from fdi_gym.faults import FaultScenario
+from baselines.filters.attitude import cross, require_attitude, rotated, taken, with_scalar
+from baselines.filters.effectiveness import F_MAX, F_MIN, P_THETA, Q_THETA, THRESHOLD, threshold_rule
+from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
+from fdi_gym.estimation import kalman
+from fdi_gym.estimation.augmented import Interval
+from fdi_gym.estimation.decision import Reading
+from fdi_gym.estimation.kalman import T, quadratic, times
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.cmg_satellite import DT, H0, JS, SIGMA_Q, cluster, inertia
 
@@ -32,16 +34,22 @@ D_GAIN = 0.002  # gain of the gimbal angles towards the measured ones, at least
 class MEKF(NamedTuple):
     """The filter's state."""
 
-    k: int  # samples seen
     q: Array  # (n, 4)
     w: Array  # (n, 3)
     d: Array  # (n, 4)
     f: Array  # (n, 4)
     P: Array  # (n, 10, 10) of (dtheta, dw, df)
+    known: Array  # (n, 6) bool: attitude, as a whole, and each rate have been reported
+    angles: Array  # (n, 4) samples at which each gimbal angle was
     nis: Array  # (n,) weighted mean of the normalised innovation squared
-    wait: Array  # (n,) first sample at which the next reset is allowed
+    samples: Array  # (n,) with an innovation so far
+    wait: Array  # (n,) number of them at which the next reset is allowed
     resets: Array  # (n,) resets so far
-    episode: Array  # (n,) which of the scenarios, for the clairvoyant one
+    reset: Array  # (n,) bool: there was one at the last sample
+    episode: Array  # (n,) which one, for the filter that is told the changes
+    nu: Array  # (n, 6) last innovation
+    S: Array  # (n, 6, 6) its covariance
+    seen: Array  # (n,) sensors in it
 
 
 def transition(q: Array, w: Array, d: Array, f: Array, r: Array, wheel: bool) -> Array:
@@ -74,23 +82,15 @@ def attitude_variance(q: Array, R: Array) -> Array:
     return 4.0 * np.diag(R)[:3] / np.maximum(q[:, 3:] ** 2, 0.05)
 
 
+def first_variance(q: Array, R: Array) -> Array:
+    """Variance (n, 6) of attitude and rate that their first measurement leaves."""
+    return np.concatenate([attitude_variance(q, R), np.tile(np.diag(R)[3:6], (len(q), 1))], axis=1)
+
+
 def first_covariance(q: Array, R: Array, p_theta: float) -> Array:
     """P (n, 10, 10) after the first measurement."""
-    P = np.zeros((len(q), 10, 10))
-    i = np.arange(10)
-    P[:, i[:3], i[:3]] = attitude_variance(q, R)
-    P[:, i[3:6], i[3:6]] = np.diag(R)[3:6]
-    P[:, i[6:], i[6:]] = p_theta
-    return P
-
-
-def changes(plant: Plant, scenarios: Sequence[FaultScenario]) -> Array:
-    """Where f changes (episodes, samples): row k is set where the f held from sample k on is not that held before."""
-    found = np.zeros((len(scenarios), 1 + max(s.steps for s in scenarios)), bool)
-    for i, scenario in enumerate(scenarios):
-        a = plant.theta_table(scenario).a
-        found[i, : len(a)] = (np.diff(a, axis=0, prepend=plant.nominal_theta[None]) != 0).any(axis=1)
-    return found
+    return taken(np.empty((len(q), 10)), np.tile(np.diag([0.0] * 6 + [p_theta] * 4), (len(q), 1, 1)), np.empty((len(q), 6)),
+                 first_variance(q, R), np.ones((len(q), 6), bool))[1]  # fmt: skip
 
 
 def mekf_filter(
@@ -102,69 +102,88 @@ def mekf_filter(
     p_reset: float = P_RESET,
     nis_max: float = NIS_MAX,
     memory: int = MEMORY,
-    threshold: float = THRESHOLD,
-) -> Diagnoser:
+) -> Filter:
     """The filter with its detector, or with resets at known changes (episodes, samples) bool."""
     require_attitude(plant)
     wheel = plant.options["fault_model"] == "wheel"
     R = plant.R[:6, :6]
     Q = np.diag([0.0] * 3 + [SIGMA_Q**2] * 3 + [q_theta] * 4)
-    decide = threshold_rule(plant, threshold)
-    i = np.arange(10)
+    scale = np.array([s.scale for s in plant.states])
+    P_0 = np.diag([*(2.0 * scale[:3]) ** 2, *scale[4:7] ** 2, *[p_theta] * 4])  # an angle is twice its q_v
+    attitude, rate, theta = np.arange(3), np.arange(3, 6), np.arange(6, 10)
 
-    def init(n: int) -> MEKF:
-        q = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
+    def start(n: int) -> MEKF:
+        x, count = np.tile(plant.trim_state, (n, 1)), np.zeros(n, np.int64)
         return MEKF(
-            0, q, np.zeros((n, 3)), np.zeros((n, 4)), np.ones((n, 4)), first_covariance(q, R, p_theta),
-            np.full(n, NIS_START), np.zeros(n, np.int64), np.zeros(n, np.int64), np.arange(n),
+            x[:, :4], x[:, 4:7], x[:, 7:], np.ones((n, 4)), np.tile(P_0, (n, 1, 1)), np.zeros((n, 6), bool),
+            np.zeros((n, 4), np.int64), np.full(n, NIS_START), count, count, count, np.zeros(n, bool), np.arange(n),
+            np.zeros((n, 6)), np.tile(R, (n, 1, 1)), count,
         )  # fmt: skip
 
-    def reset(s: MEKF, now: Array, y: Array) -> MEKF:
-        """Open the covariance of the effectiveness in the episodes `now`; s.k is the number of the sample just used."""
+    def predict(s: MEKF, at: Interval) -> MEKF:
+        Phi = transition(s.q, s.w, s.d, s.f, at.u, wheel)
+        x = plant.propagate(0.0, np.concatenate([s.q, s.w, s.d], axis=1), at.u, s.f)
+        return s._replace(q=x[:, :4], w=x[:, 4:7], d=x[:, 7:], P=Phi @ s.P @ T(Phi) + Q)
+
+    def begun(s: MEKF, y: Array, seen: Array) -> MEKF:
+        """Attitude and rate as they are reported for the first time."""
+        fresh = seen[:, :6] & ~s.known
+        fresh[:, :3] = (fresh[:, :3].all(axis=1) & seen[:, 10])[:, None]
+        if not fresh.any():
+            return s
+        q = np.where(fresh[:, :1], with_scalar(y[:, None, :3], y[:, 10])[:, 0], s.q)
+        x = np.concatenate([np.zeros_like(s.w), s.w, s.f], axis=1)
+        x, P = taken(x, s.P, y[:, :6], first_variance(q, R), fresh)
+        return s._replace(q=q, w=x[:, 3:6], P=P, known=s.known | fresh)
+
+    def reset(s: MEKF, now: Array, y: Array, seen: Array) -> MEKF:
+        """Open the covariance of the effectiveness in the episodes `now`."""
         if not now.any():
             return s
-        w, P, nis = s.w.copy(), s.P.copy(), s.nis.copy()
-        w[now] = y[now, 3:6]
+        w, P, nis, rows = s.w.copy(), s.P.copy(), s.nis.copy(), np.flatnonzero(now)
+        w[now] = np.where(seen[now, 3:6], y[now, 3:6], w[now])
         P[now, 6:, :6] = P[now, :6, 6:] = 0.0
-        P[now, 6:, 6:] = p_reset * np.eye(4)
-        for part, extra in ((i[:3], 4.0 * np.diag(R)[:3]), (i[3:6], np.diag(R)[3:6])):
-            P[np.ix_(now.nonzero()[0], part, part)] += np.diag(extra)
+        P[np.ix_(rows, theta, theta)] = p_reset * np.eye(4)
+        for part, extra in ((attitude, 4.0 * np.diag(R)[:3]), (rate, np.diag(R)[3:6])):
+            P[np.ix_(rows, part, part)] += np.diag(extra)
         nis[now] = NIS_START
-        return s._replace(w=w, P=P, nis=nis, wait=np.where(now, s.k + memory, s.wait), resets=s.resets + now)
+        return s._replace(w=w, P=P, nis=nis, wait=np.where(now, s.samples + memory, s.wait), resets=s.resets + now)
 
-    def due(s: MEKF) -> Array:
+    def due(s: MEKF, k: Array) -> Array:
         if known_changes is not None:
-            return known_changes[s.episode, min(s.k, known_changes.shape[1] - 1)]
-        return (s.nis > nis_max) & (s.k >= s.wait)
+            return known_changes[s.episode, np.minimum(k, known_changes.shape[1] - 1)]
+        return (s.nis > nis_max) & (s.samples >= s.wait)
 
-    def update(s: MEKF, obs: Array) -> tuple[MEKF, Diagnosis]:
-        y, r, _ = plant.split(obs)
-        if s.k == 0:  # no interval has ended: the filter starts from the first measurement
-            q4 = y[:, 10] * np.sqrt(np.maximum(0.0, 1.0 - (y[:, :3] ** 2).sum(axis=1)))
-            q = np.concatenate([y[:, :3], q4[:, None]], axis=1)
-            s = s._replace(q=q, w=y[:, 3:6], d=y[:, 6:10], P=first_covariance(q, R, p_theta))
-        else:
-            Phi = transition(s.q, s.w, s.d, s.f, r, wheel)
-            P = Phi @ s.P @ T(Phi) + Q
-            x = plant.propagate(0.0, np.concatenate([s.q, s.w, s.d], axis=1), r, s.f)
-            q, w, d = x[:, :4], x[:, 4:7], x[:, 7:]
-            d = d + max(D_GAIN, 1.0 / (s.k + 1)) * (y[:, 6:10] - d)
-            innovation = y[:, :6] - np.concatenate([q[:, :3], w], axis=1)
-            H = observation(q)
-            HP = H @ P
-            solved = np.linalg.solve(HP @ T(H) + R, np.concatenate([HP, innovation[..., None]], axis=2))
-            K = T(solved[..., :10])
-            dx = times(K, innovation)
-            nis = np.einsum("ni,ni->n", innovation, solved[..., 10])
-            s = s._replace(
-                q=rotated(q, dx[:, :3]), w=w + dx[:, 3:6], d=d, f=np.clip(s.f + dx[:, 6:], F_MIN, F_MAX),
-                P=symmetric(P - K @ HP), nis=s.nis + (nis - s.nis) / memory,
-            )  # fmt: skip
-        now = due(s)
-        s = reset(s, now, y)
-        return s._replace(k=s.k + 1), decide(s.f, s.P[:, 6:, 6:], now & (known_changes is None))
+    def update(s: MEKF, at: Interval, y: Array, seen: Array) -> MEKF:
+        used = seen[:, :6] & s.known
+        H = observation(s.q)
+        nu = y[:, :6] - np.concatenate([s.q[:, :3], s.w], axis=1)
+        done = kalman.update(np.zeros((len(y), 10)), s.P, nu, H, R, used)
+        nis = quadratic(done.nu, done.S) + (~used).sum(axis=1)  # a missing sensor counts with its expectation
+        gain = np.where(seen[:, 6:10], np.maximum(D_GAIN, 1.0 / (s.angles + 1)), 0.0)
+        counts = used.any(axis=1)
+        s = s._replace(
+            q=rotated(s.q, done.x[:, :3]), w=s.w + done.x[:, 3:6], d=s.d + gain * (y[:, 6:10] - s.d),
+            f=np.clip(s.f + done.x[:, 6:], F_MIN, F_MAX), P=done.P, angles=s.angles + seen[:, 6:10],
+            nis=np.where(counts, s.nis + (nis - s.nis) / memory, s.nis), samples=s.samples + counts,
+            nu=done.nu, S=done.S, seen=used.sum(axis=1),
+        )  # fmt: skip
+        s = begun(s, y, seen)
+        now = due(s, at.k)
+        return reset(s, now, y, seen)._replace(reset=now)
 
-    return Diagnoser(init, update)
+    def read(s: MEKF) -> Reading:
+        flag = s.reset & (known_changes is None)  # a reset at a change that was known is no flag
+        signals = {"flag": flag, "statistic": s.nis, "resets": s.resets}
+        x = np.concatenate([s.q, s.w, s.d], axis=1)
+        return Reading(s.f - 1.0, s.P[:, 6:, 6:], x, None, s.nu, s.S, s.seen, signals=signals)
+
+    def expect(s: MEKF, at: Interval) -> Array:
+        y = np.concatenate([s.q[:, :3], s.w, s.d, np.where(s.q[:, 3:] < 0.0, -1.0, 1.0)], axis=1)
+        known = np.column_stack([s.known, s.angles > 0, s.known[:, 0]])
+        return np.where(known, y, np.nan)
+
+    return Filter(start, predict, update, read, expect=expect)
 
 
 @diagnoser("mekf", "Multiplicative extended Kalman filter, covariance opened by a test on the innovations")
@@ -191,24 +210,5 @@ def mekf(
     Raises:
         NotApplicableError: The plant has no attitude.
     """
-    return mekf_filter(
-        plant, q_theta=q_theta, p_theta=p_theta, p_reset=p_reset, nis_max=nis_max, memory=memory, threshold=threshold
-    )
-
-
-@diagnoser("mekf_clairvoyant", "The same filter, told when the effectiveness changes", clairvoyant=True)
-def mekf_clairvoyant(
-    plant: Plant, *, scenarios: Sequence[FaultScenario], q_theta: float = Q_THETA, threshold: float = THRESHOLD
-) -> Diagnoser:
-    """The multiplicative filter with resets exactly at the changes of f, which it is told (when, not what).
-
-    Args:
-        plant: The satellite.
-        scenarios: One per episode, in the order of the batch.
-        q_theta, threshold: As in `mekf`.
-
-    Raises:
-        NotApplicableError: The plant has no attitude.
-    """
-    require_attitude(plant)
-    return mekf_filter(plant, changes(plant, scenarios), q_theta=q_theta, threshold=threshold)
+    filter = mekf_filter(plant, q_theta=q_theta, p_theta=p_theta, p_reset=p_reset, nis_max=nis_max, memory=memory)
+    return diagnoser_of(plant, filter, threshold_rule(plant, threshold))

@@ -9,10 +9,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from fdi_gym.estimation.missile_model import Sample
 
 from fdi_gym.estimation import missile_model as model
 from fdi_gym.estimation.kalman import T, symmetric
-from fdi_gym.estimation.missile_model import Sample
 from fdi_gym.plant import Array
 from fdi_gym.plants.missile_pitch import DEG, DT, K_Q
 

@@ -119,6 +119,10 @@ def bank(b: Hypotheses) -> Filter:
         mu = mixing.weigh(s.c, log_likelihood(done.nu, done.S).reshape(n, labels), LEAST)
         return Models(done.x.reshape(n, labels, N), done.P.reshape(n, labels, N, N), mu, mu)
 
+    def state(s: Models) -> Array:
+        mu = s.mu / s.mu.sum(axis=1, keepdims=True)
+        return (mu[..., None] * s.X[..., x]).sum(axis=1)
+
     def read(s: Models) -> Reading:
         deviation = offset + (direction @ s.X[..., z, None])[..., 0]  # (n, labels, p)
         mu = s.mu / s.mu.sum(axis=1, keepdims=True)
@@ -126,10 +130,9 @@ def bank(b: Hypotheses) -> Filter:
         D = deviation - mean[:, None]
         within = direction @ s.P[..., z, z] @ np.swapaxes(direction, -1, -2)
         P = (mu[..., None, None] * (within + D[..., :, None] * D[..., None, :])).sum(axis=1)
-        state = (mu[..., None] * s.X[..., x]).sum(axis=1)
-        return Reading(mean, P, state, cost=-2.0 * np.log(s.mu), probs=mu)
+        return Reading(mean, P, state(s), cost=-2.0 * np.log(s.mu), probs=mu)
 
-    return Filter(start, predict, update, read)
+    return Filter(start, predict, update, read, expect=lambda s, at: model.expect(state(s), at))
 
 
 @diagnoser("multiple_model_ekf", "Interacting multiple models, one extended Kalman filter per label, for any plant")

@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.calibration import Persistence, uniform
 from fdi_gym.estimation.decision import Reading, Rule, by_candidate, by_labels
 from fdi_gym.estimation.kalman import T, masked, right_divide, symmetric, times

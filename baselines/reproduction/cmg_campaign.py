@@ -14,10 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import tyro
 
-from baselines.filters.mekf import changes
+from baselines.oracles.mekf_clairvoyant import changes
 from baselines.reproduction.tables import pieces
-from fdi_gym.diagnosis import find_diagnoser, make_diagnoser
-from fdi_gym.estimation.covariance_adaptation import BETA_0, MEMORY
+from fdi_gym.diagnosis import find_diagnoser, make_diagnoser, run
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant, load_plant
 from fdi_gym.plants import cmg_satellite as cmg
@@ -97,25 +96,16 @@ def watch(plant: Plant, scenarios: list[FaultScenario], record: Record, method: 
     known = {"scenarios": scenarios} if find_diagnoser(name).clairvoyant else {}
     diagnoser = make_diagnoser(name, plant, **known, **tuning)
     n, samples, _ = record.obs.shape
-    theta, sd = np.empty((n, samples, 4)), np.empty((n, samples))
-    label, flag = np.empty((n, samples), np.int64), np.zeros((n, samples), bool)
     begun = time.process_time()
-    state = diagnoser.init(n)
-    resets = np.zeros(n, np.int64)
-    for k in range(samples):
-        state, said = diagnoser.update(state, record.obs[:, k])
-        theta[:, k], label[:, k] = said.estimate, said.label
-        assert said.estimate_std is not None
-        sd[:, k] = np.sqrt((said.estimate_std**2).mean(axis=1))
-        inner = state[0]
-        if hasattr(inner, "beta"):
-            flag[:, k] = (inner.beta > BETA_0) & (k > MEMORY + 1)
-        elif hasattr(inner, "resets") and not known:  # a reset that was told is no flag
-            flag[:, k], resets = inner.resets > resets, inner.resets
+    said = run(diagnoser, record.obs, signals=True)
     seconds = time.process_time() - begun
+    assert said.estimate is not None
+    assert said.estimate_std is not None
+    sd, signals = np.sqrt((said.estimate_std**2).mean(axis=2)), said.signals or {}
+    flag = signals["flag"] > 0 if "flag" in signals else np.zeros((n, samples), bool)
     per_step = {"caukf": 40, "gaukf": 16, "sgaukf": 4, "sgaukf_odd": 4, "dual_gaukf": 16, "dual_sgaukf": 4}.get(name, 0)
-    adapted = getattr(state[0], "adapted", np.zeros(n, np.int64))
-    return Watched(theta, label, sd, flag, samples - 1 + per_step * adapted, seconds)
+    adapted = signals["adapted"][:, -1].astype(np.int64) if "adapted" in signals else np.zeros(n, np.int64)
+    return Watched(said.estimate, said.label.astype(np.int64), sd, flag, samples - 1 + per_step * adapted, seconds)
 
 
 def rmse(error: Array) -> float | None:

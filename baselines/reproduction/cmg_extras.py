@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from baselines.filters.cramer_rao_oracle import Q_FLOOR, bound_step, first_covariance, opened
+from baselines.filters.mekf import first_covariance
+from baselines.oracles.cramer_rao_oracle import Q_FLOOR, bound_step, opened
 from baselines.reproduction.cmg_campaign import Piece, scenarios_of, table4_outcome, watch
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant

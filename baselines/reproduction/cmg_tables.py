@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from baselines.filters.cramer_rao_oracle import P_PRIOR
+from baselines.oracles.cramer_rao_oracle import P_PRIOR
 from baselines.reproduction import cmg_reference as ref
 from baselines.reproduction.cmg_campaign import TABLE_4_BLOCK
 from baselines.reproduction.cmg_extras import TRIED

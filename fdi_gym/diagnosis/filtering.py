@@ -3,7 +3,8 @@
 A filter says what it starts from, how it predicts over an interval from the model alone, how it uses the sensors that
 reported, and what it then knows. Counters, gaps, the first sample and the decision are not its business: a sensor that did
 not report arrives as 0 with `seen` False, a command or a known signal that is missing is held, and each episode has its own
-sample number.
+sample number. Of measurements that mean the same (a quaternion and its negative, an angle a turn later) it gets the one
+nearest what it expects.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from fdi_gym.diagnosis.contract import Diagnoser, Diagnosis, choose
 from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading, Rule, Verdict
+from fdi_gym.estimation.equivalent import has_equivalents, nearest
 from fdi_gym.plant import Array, Plant
 
 
@@ -33,6 +35,7 @@ class Filter(NamedTuple):
     first_sample: bool = True  # the sample before any interval is a measurement; False: the prior stands there
     begin: Callable[[Any, Interval, Array], Any] | None = None  # (start, interval, y)
     needs: Array | None = None  # (n_y,) bool, for `begin`. Default: all sensors
+    expect: Callable[[Any, Interval], Array] | None = None  # what the sensors will read (n, n_y); NaN where that is open
 
 
 class Running(NamedTuple):
@@ -74,6 +77,8 @@ def _step(plant: Plant, filter: Filter, rule: Rule, s: Running, obs: Array) -> t
         state = filter.predict(state, at)
     elif ready.any():
         state = choose(ready, filter.predict(state, at), state)
+    if filter.expect is not None and has_equivalents(plant):
+        y = nearest(plant, y, seen, filter.expect(state, at))
     measures = begun if filter.first_sample else ready
     if filter.begin is not None and not begun.all():
         needs = seen if filter.needs is None else seen[:, filter.needs]

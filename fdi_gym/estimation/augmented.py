@@ -97,6 +97,10 @@ class AugmentedModel(NamedTuple):
         y = self.plant.measure(at.k * self.plant.dt, X[..., self.x], at.u, theta, d)
         return y[..., self.sensors]
 
+    def expect(self, x: Array, at: Interval) -> Array:
+        """What all sensors of the healthy plant read in the states x (n, n_x): (n, n_y)."""
+        return self.plant.measure(at.k * self.plant.dt, x, at.u, None, at.d)
+
     def limited(self, P: Array) -> Array:
         """P (n, N, N) with the variances of z back at their limit, correlations kept."""
         variance = np.einsum("nii->ni", P)

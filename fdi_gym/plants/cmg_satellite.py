@@ -12,7 +12,7 @@
 | fault theta | effectiveness f1..f4 of the CMGs: 1 healthy, 0 dead |
 
 The attitude is propagated continuously: q4 may become negative, and y carries its sign. Consumers rebuild
-q4 = sign sqrt(max(0, 1 - |q_v|^2)). The gimbals always move as commanded, so only w and q carry fault information.
+q4 = sign sqrt(max(0, 1 - |q_v|^2)); q and -q are the same attitude, d and d + 2 pi the same gimbal angle. The gimbals always move as commanded, so only w and q carry fault information.
 
 Options:
     reference: "slew" (default; roll, pitch and yaw follow sines of 5 deg and 13, 16 and 20 s) or "regulate" (the
@@ -531,7 +531,7 @@ def plant(
     q = [Signal(f"q{i + 1}", "", -1.1, 1.1, 0.1, nominal=x0[i]) for i in range(4)]
     w = [Signal(f"w{i + 1}", "rad/s", -20.0, 20.0, 0.05, SIGMA_Q, x0[4 + i]) for i in range(3)]
     d = [Signal(f"d{i + 1}", "rad", -2500.0, 2500.0, 0.2) for i in range(4)]
-    seen = [*q[:3], *w, *d]
+    seen = [*q[:3], *w, *(s._replace(period=2 * np.pi) for s in d)]
     return Plant(
         id=ID, version=VERSION, options=options,
         description="Satellite with four control moment gyros: loss of effectiveness of any subset",
@@ -556,6 +556,7 @@ def plant(
         true_feedback=feedback == "true", physical=physical, perturb=perturb,
         reference=lambda scenario: _rows(reference, scenario.steps),
         shapes=Shapes(Slew if reference == "slew" else Regulate, Nothing, Physical),
+        quaternions=((0, 1, 2, 10),),
         monitor=lambda state: {"det": singularity(state[..., 7:])},
         isolation_reward=np.eye(16) - 1.0, identification_reward=lambda error: -np.abs(error).mean(axis=-1),
     )  # fmt: skip
