@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from baselines.filters.sgaukf import sgaukf
 from conftest import build, readings, states
 from scipy.stats import multivariate_normal
 from test_general_filters import belief_of, interval, model_of
@@ -33,10 +32,6 @@ def faulty(plant):
     return flights_of(plant, "standard", 400_000, FLIGHTS, True)[1]
 
 
-def samples(record, first=0, last=150):
-    return range(first, min(last, int(record.length.min())))
-
-
 def test_two_stage_is_the_augmented_extended_filter(plant, faulty):
     """Mean and covariance of state, fault and innovation, through a fault-free and a faulty stretch and through gaps."""
     model = model_of(plant)
@@ -59,6 +54,7 @@ def test_two_stage_equals_the_papers_on_the_linear_plant(b747):
     """Same prior and random walk: the Keller-Darouach recursion of the 747 to rounding."""
     record = flights_of(b747, "standard", 400_000, FLIGHTS, True)[1]
     model = model_of(b747, x0_std=[0.1] * 4, z0_std=[1, 1, 2, 2], z_walk=[1e-3] * 4)
+    model = model._replace(limit=np.full(8, np.inf))
     own = papers_two_stage(b747, aging(b747, 1e-6, "none", 0.99, 1e-4, 1.0))
     obs = record.obs[:, :400]
     for a, b in zip(readings(b747, two_stage_filter(model, first_sample=False), obs), readings(b747, own, obs), strict=True):
@@ -222,7 +218,7 @@ def test_general_forms_agree_with_the_satellites_own():
     assert np.abs(1.0 + s.X[:, model.z] - own[:, -1]).max() < 0.05 * jump
     model = model_of(plant, walk=WALK)
     *_, a = states(plant, adaptive_filter(model, belief_of(plant).z_size, "simplified"), record.obs)
-    theirs = run(sgaukf(plant), record.obs).estimate[:, -1]
+    theirs = run(make_diagnoser("sgaukf", plant), record.obs).estimate[:, -1]
     assert np.abs(1.0 + a.filter.X[:, model.z] - record.theta[:, -1]).max() < 0.05
     assert np.abs(1.0 + a.filter.X[:, model.z] - theirs).max() < 0.06
 
