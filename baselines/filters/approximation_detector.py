@@ -82,7 +82,9 @@ class Detector(NamedTuple):
     W: Array  # (n, 11) weights after the update
 
 
-Rates = Callable[[Array, Array | None, Known], tuple[Array, Array]]  # (a, spread, known) -> rate of a, bound on that of x - a
+Rates = Callable[
+    [Array, Array | None, Known], tuple[Array, Array]
+]  # (a, spread, known) -> rate of a, bound on that of x - a
 
 
 def basis(alpha: Array) -> Array:
@@ -201,7 +203,7 @@ def exceeded() -> Rule:
 
     def step(s: Declared, k: Array, r: Reading, informed: Array) -> tuple[Declared, Verdict]:
         assert r.signals is not None
-        over = (np.abs(r.signals["residual"]) > r.signals["threshold"]).any(axis=1)
+        over = np.any(np.abs(r.signals["residual"]) > r.signals["threshold"], axis=1)
         s = declare(s, np.ones(len(k), np.int64), over, np.zeros(len(k), bool), latched, informed)
         return s, Verdict(s.label > 0, np.zeros(len(k), np.int64))
 

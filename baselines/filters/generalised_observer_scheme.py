@@ -65,7 +65,7 @@ def predict(bank: Isolation) -> Isolation:
 
 
 def update(bank: Isolation, detector: Detector, y: Array, seen: Array, size: Array, classes: tuple[int, ...]) -> Isolation:
-    """With the measured alpha and q, y (n, 2), that reported, seen (n, 2), after the detector. size (2,) bounds their noise."""
+    """With what was measured, after the detector's update; y, seen (n, 2), size (2,) bounds the noise."""
     sampled = detector.sampled
     first = detector.alarm & ~bank.started & seen.all(axis=1)  # the alarm sample k_d, where both sensors reported
     started = bank.started | first
@@ -127,6 +127,31 @@ def tie_broken(started: Array, excluded: Array, energy: Array, classes: tuple[in
     return np.where(started, np.array(classes)[np.argmin(np.where(out, np.inf, energy), axis=-1)], NONE)
 
 
+def gos_filter(sigma: Array, classes: tuple[int, ...]) -> Filter:
+    """Detector and isolation estimators. sigma (2,): noise of alpha and q."""
+    detector, size = detection.detector_filter(sigma), NOISE_FACTOR * sigma + NU_0
+
+    def begin(s: tuple[Detector, Isolation], at: Interval, y: Array) -> tuple[Detector, Isolation]:
+        assert detector.begin is not None
+        return detector.begin(s[0], at, y), s[1]
+
+    def forward(s: tuple[Detector, Isolation], at: Interval) -> tuple[Detector, Isolation]:
+        return detection.predict(s[0], at), predict(s[1])
+
+    def step(s: tuple[Detector, Isolation], at: Interval, y: Array, seen: Array) -> tuple[Detector, Isolation]:
+        found = detector.update(s[0], at, y, seen)
+        return found, update(s[1], found, y[:, :2], seen[:, :2], size, classes)
+
+    def read(s: tuple[Detector, Isolation]) -> Reading:
+        found, bank = s
+        return Reading(x=detection.state(found), signals=detection.signals(found) | {
+            "isolation residuals": bank.eps, "isolation thresholds": bank.threshold, "parameters": bank.used,
+            "energy": bank.energy, "excluded": bank.excluded, "isolating": bank.started,
+        })  # fmt: skip
+
+    return Filter(lambda n: (detection.start(n), start(n, len(classes))), forward, step, read, True, begin, model.SENSORS)
+
+
 def elimination(classes: tuple[int, ...], strict: bool) -> Rule:
     """The scheme's verdict, with the parameter of the class that it names: a jam counts 1, the rest 0."""
     detected = detection.exceeded()
@@ -166,26 +191,4 @@ def gos(plant: Plant, *, classes: tuple[int, ...] = (1, 2, 3, 4, 5), strict: boo
     classes = tuple(classes)
     if not classes or not set(classes) <= {1, 2, 3, 4, 5} or len(set(classes)) < len(classes):
         raise ValueError(f"classes are different labels in 1..5, not {classes}")
-    sigma = detection.sensor_sigma(plant)
-    detector, size = detection.detector_filter(sigma), NOISE_FACTOR * sigma + NU_0
-
-    def begin(s: tuple[Detector, Isolation], at: Interval, y: Array) -> tuple[Detector, Isolation]:
-        assert detector.begin is not None
-        return detector.begin(s[0], at, y), s[1]
-
-    def forward(s: tuple[Detector, Isolation], at: Interval) -> tuple[Detector, Isolation]:
-        return detection.predict(s[0], at), predict(s[1])
-
-    def step(s: tuple[Detector, Isolation], at: Interval, y: Array, seen: Array) -> tuple[Detector, Isolation]:
-        found = detector.update(s[0], at, y, seen)
-        return found, update(s[1], found, y[:, :2], seen[:, :2], size, classes)
-
-    def read(s: tuple[Detector, Isolation]) -> Reading:
-        found, bank = s
-        return Reading(x=detection.state(found), signals=detection.signals(found) | {
-            "isolation residuals": bank.eps, "isolation thresholds": bank.threshold, "parameters": bank.used,
-            "energy": bank.energy, "excluded": bank.excluded, "isolating": bank.started,
-        })  # fmt: skip
-
-    filter = Filter(lambda n: (detection.start(n), start(n, len(classes))), forward, step, read, True, begin, model.SENSORS)
-    return diagnoser_of(plant, filter, elimination(classes, strict))
+    return diagnoser_of(plant, gos_filter(detection.sensor_sigma(plant), classes), elimination(classes, strict))

@@ -285,7 +285,9 @@ def innovation_oracle(
             candidates = found.log if none_allowed else np.where(np.arange(6) == 0, -np.inf, found.log)
             log, size = np.where(due[:, None], candidates, log), np.where(due[:, None], found.size, size)
         log = np.where(active[:, None], log, certain)  # outside the windows the answer is none
-        return Told(o.windows, o.known, first, second, np.where(opens, o.known.delta, o.jam), free, window, jammed, log, size)
+        return Told(
+            o.windows, o.known, first, second, np.where(opens, o.known.delta, o.jam), free, window, jammed, log, size
+        )
 
     def read(o: Told) -> Reading:
         probs = np.exp(o.log - logsumexp(o.log, axis=1, keepdims=True))

@@ -58,9 +58,9 @@ def _step(plant: Plant, filter: Filter, rule: Rule, s: Running, obs: Array) -> t
     y, u, known = plant.split(obs)
     seen = np.isfinite(y)
     whole = bool(seen.all())
-    held = None
+    held: Array | None = None
     if not (np.isfinite(u).all() and np.isfinite(known).all()):
-        held = ~(np.isfinite(u).all(axis=1) & np.isfinite(known).all(axis=1))
+        held = np.any(~np.isfinite(np.concatenate([u, known], axis=1)), axis=1)
         u, known = np.where(np.isfinite(u), u, s.u), np.where(np.isfinite(known), known, s.known)
     if not whole:
         y = np.where(seen, y, 0.0)
