@@ -59,6 +59,7 @@ class Verdict(NamedTuple):
     label: Array  # (n,) int
     z: Array | None = None  # (n, p) the deviation that is reported in place of the reading's
     evidence: Evidence = Evidence()
+    P: Array | None = None  # (n, p, p) the covariance that is reported in place of the reading's
     signals: dict[str, Array] | None = None  # (n, ...) each, beside the reading's
 
 

@@ -15,12 +15,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from fdi_gym.estimation.missile_model import Sample
 from scipy.special import logsumexp
 
-from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
-from fdi_gym.estimation import missile_model as model
-from fdi_gym.estimation.kalman import T, symmetric, times
+from baselines.filters import missile_model as model
+from baselines.filters.missile_model import Known
+from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
+from fdi_gym.estimation.augmented import Interval
+from fdi_gym.estimation.decision import Reading, Rule, Verdict
+from fdi_gym.estimation.kalman import T, masked, symmetric, times
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.missile_pitch import DT
@@ -84,24 +86,27 @@ def nothing(n: int, c: int) -> Information:
     return Information(np.zeros((n, c, c)), np.zeros((n, c)), np.zeros(n))
 
 
-def regressors(alpha: Array, sample: Sample, m: int, beta: Array | None) -> Array:
+def regressors(alpha: Array, known: Known, m: int, beta: Array | None) -> Array:
     """B (n, 2, m + 4 g): the coefficient errors' columns, then beta Z of each linear label by growth rate."""
-    columns = [model.uncertainty_regressors(alpha, sample.mach)]
+    columns = [model.uncertainty_regressors(alpha, known.mach)]
     if m == 8:
-        columns.append(model.fin(alpha, sample.mach)[:, :, None] * sample.delta[:, None, None] * np.eye(2))
+        columns.append(model.fin(alpha, known.mach)[:, :, None] * known.delta[:, None, None] * np.eye(2))
     if beta is not None:
         for label in LINEAR:
-            Z, _ = model.fault_function(label, alpha, sample.delta, sample.jet, sample.mach)
+            Z, _ = model.fault_function(label, alpha, known.delta, known.jet, known.mach)
             columns.append(Z[:, :, None] * beta[:, None, :])
     return np.concatenate(columns, axis=-1)
 
 
-def predict(f: Tracked, before: Sample, now: Sample, m: int, betas: tuple[Array, Array] | None) -> Tracked:
-    """From k - 1 to k by Heun's rule; the sensitivities gain Ts (Phi B_{k-1} + B_k)/2."""
+def predict(f: Tracked, before: Known, now: Known, m: int, betas: tuple[Array, Array] | None) -> Tracked:
+    """From k - 1 to k by Heun's rule; the sensitivities gain Ts (Phi B_{k-1} + B_k)/2.
 
-    def jacobian(alpha: Array, sample: Sample) -> Array:
+    Where the actuators are not known at both ends, or nothing was measured for long, the state is lost: it may be anywhere.
+    """
+
+    def jacobian(alpha: Array, known: Known) -> Array:
         F = np.zeros((len(alpha), 2, 2))
-        F[:, 0, 0], F[:, 1, 0] = model.slopes(alpha, sample.delta, sample.mach)
+        F[:, 0, 0], F[:, 1, 0] = model.slopes(alpha, known.delta, known.mach)
         F[:, 0, 1] = 1.0
         return F
 
@@ -113,28 +118,34 @@ def predict(f: Tracked, before: Sample, now: Sample, m: int, betas: tuple[Array,
     E = DT * (jacobian(alpha, before) + jacobian(euler[:, 0], now)) / 2
     Phi = np.eye(2) + E + E @ E / 2
     B1, B2 = regressors(alpha, before, m, first), regressors(euler[:, 0], now, m, second)
-    return Tracked(f.x + DT * (f1 + f2) / 2, Phi @ f.P @ T(Phi) + Q, Phi @ f.s + DT * (Phi @ B1 + B2) / 2)
+    x = np.clip(f.x + DT * (f1 + f2) / 2, -model.RANGE, model.RANGE)
+    P, s = Phi @ f.P @ T(Phi) + Q, Phi @ f.s + DT * (Phi @ B1 + B2) / 2
+    lost = before.held | now.held | (np.einsum("nii->ni", P) > model.RANGE**2).any(axis=1)
+    if lost.any():
+        P[lost], s[lost] = np.diag(model.RANGE**2), 0.0
+    return Tracked(x, P, s)
 
 
-def update(f: Tracked, y: Array, R: Array) -> tuple[Tracked, Information]:
-    """With y_k, and what the innovation says."""
-    v, S = y - f.x, f.P + R
-    K = f.P @ np.linalg.inv(S)  # two by two, used on many columns
-    weighted = np.linalg.solve(S, np.concatenate([f.s, v[..., None]], axis=-1))
-    found = T(f.s) @ weighted
+def update(f: Tracked, y: Array, seen: Array, R: Array) -> tuple[Tracked, Information]:
+    """With what was measured at k, y and seen (n, 2), and what the innovation says."""
+    v, S, PHt, HsT = masked(seen, y - f.x, f.P + R, f.P, T(f.s))
+    Hs = T(HsT)
+    K = PHt @ np.linalg.inv(S)  # two by two, used on many columns
+    weighted = np.linalg.solve(S, np.concatenate([Hs, v[..., None]], axis=-1))
+    found = HsT @ weighted
     c = (v * weighted[..., -1]).sum(axis=-1) + np.linalg.slogdet(S)[1]
-    after = Tracked(f.x + times(K, v), symmetric(f.P - K @ f.P), f.s - K @ f.s)
+    after = Tracked(f.x + times(K, v), symmetric(f.P - K @ T(PHt)), f.s - K @ Hs)
     return after, Information(found[..., :-1], found[..., -1], c)
 
 
-class Evidence(NamedTuple):
+class Marginal(NamedTuple):
     """Log evidence of the labels (n, 6), up to a constant, and the size of each linear label now (n, 4)."""
 
     log: Array
     size: Array
 
 
-def evidence(free: Information, window: Information, jammed: Information, beta: Array, p: Priors) -> Evidence:
+def evidence(free: Information, window: Information, jammed: Information, beta: Array, p: Priors) -> Marginal:
     """Marginal likelihoods of the window's innovations, given what the fault-free samples say about rho."""
     m = len(p.rho)
     prior = free.A + np.diag(1 / p.rho**2)
@@ -160,23 +171,32 @@ def evidence(free: Information, window: Information, jammed: Information, beta: 
     logs = np.zeros((len(log), 6))
     logs[:, LINEAR] = log[:, None] + total - np.log(2 * len(p.rates))
     logs[:, 0], logs[:, 4] = log, marginal(jammed)[0]
-    return Evidence(logs, (share * mean * beta[:, None, :, None]).sum(axis=(2, 3)))
+    return Marginal(logs, (share * mean * beta[:, None, :, None]).sum(axis=(2, 3)))
 
 
-class Oracle(NamedTuple):
-    """State at sample k."""
+class Told(NamedTuple):
+    """State after a sample."""
 
-    k: int  # samples shown so far
-    begun: Array  # (n,) bool: has seen its first sample
     windows: Array  # (n, w, 2) first and end step of each
-    sample: Sample
+    known: Known
     first: Tracked  # nominal model
     second: Tracked  # with the fin where it was at the last onset
-    held: Array  # (n,) that angle
+    jam: Array  # (n,) that angle
     free: Information  # of fault-free samples about rho
     window: Information  # of the samples since the onset, fault columns included
     jammed: Information  # the same of the second filter
-    said: Diagnosis
+    log: Array  # (n, 6) log evidence of the labels
+    size: Array  # (n, 4) size of each linear label
+
+
+def most_probable() -> Rule:
+    """The most probable label at every sample: the times are known, so nothing has to persist."""
+
+    def step(s: None, k: Array, r: Reading, informed: Array) -> tuple[None, Verdict]:
+        label = np.argmax(np.asarray(r.probs), axis=1)
+        return None, Verdict(label > 0, label)
+
+    return Rule(lambda n: None, step)
 
 
 @diagnoser("innovation_oracle", "Knows the onset: evidence of the innovations under the process's priors", clairvoyant=True)
@@ -207,37 +227,47 @@ def innovation_oracle(
     m, columns = len(p.rho), len(p.rho) + len(LINEAR) * len(p.rates)
     R = plant.R[:2, :2]
 
-    def init(n: int) -> Oracle:
+    certain = np.where(np.arange(6) == 0, 0.0, -np.inf)  # there is no fault
+
+    def start(n: int) -> Told:
         if n != len(scenarios):
             raise ValueError(f"the oracle was told of {len(scenarios)} flights, not {n}")
-        told = [[(f.onset, NEVER if f.end is None else f.end) for f in sorted(s.faults, key=lambda f: f.onset)]
-                for s in scenarios]  # fmt: skip
+        times_of = [[(f.onset, NEVER if f.end is None else f.end) for f in sorted(s.faults, key=lambda f: f.onset)]
+                    for s in scenarios]  # fmt: skip
         if not hard:
-            told = [windows or [(PSEUDO_ONSET, NEVER)] for windows in told]
-        longest = max(1, *(len(windows) for windows in told))
-        windows = np.array([windows + [(NEVER, NEVER)] * (longest - len(windows)) for windows in told], dtype=np.int64)
+            times_of = [windows or [(PSEUDO_ONSET, NEVER)] for windows in times_of]
+        longest = max(1, *(len(windows) for windows in times_of))
+        windows = np.array([windows + [(NEVER, NEVER)] * (longest - len(windows)) for windows in times_of], np.int64)
         x, P, none = np.zeros((n, 2)), np.tile(R, (n, 1, 1)), np.zeros(n)
-        said = Diagnosis(np.zeros(n, bool), np.zeros(n, np.int64), np.zeros((n, 5)), None, np.eye(6)[np.zeros(n, int)])
-        return Oracle(0, np.zeros(n, bool), windows, Sample(none, none, none, none, none),
-                      Tracked(x, P, np.zeros((n, 2, columns))), Tracked(x, P, np.zeros((n, 2, m))), none,
-                      nothing(n, m), nothing(n, columns), nothing(n, m), said)  # fmt: skip
+        return Told(windows, model.unknown(n), Tracked(x, P, np.zeros((n, 2, columns))), Tracked(x, P, np.zeros((n, 2, m))),
+                    none, nothing(n, m), nothing(n, columns), nothing(n, m), np.tile(certain, (n, 1)),
+                    np.zeros((n, len(LINEAR))))  # fmt: skip
 
-    def observe(o: Oracle, obs: Array) -> tuple[Oracle, Diagnosis]:
-        now, k = model.read(plant, obs), o.k
+    def inside(o: Told, k: Array) -> Array:
+        """(n, w): the interval that ends at k was under this window's fault."""
         on, end = o.windows[..., 0], o.windows[..., 1]
-        inside = (on < k) & (k <= end)  # the interval that ends at k was under a fault
-        active, opens = np.asarray(inside.any(axis=1)), np.asarray((on == k).any(axis=1))
-        settled = ~(active | ((end < k) & (k <= end + SETTLE)).any(axis=1))
-        since = np.where(active, k - np.where(inside, on, 0).max(axis=1), 0) * DT
-        beta = 1 - np.exp(-p.rates * since[:, None])
-        earlier = 1 - np.exp(-p.rates * np.maximum(since - DT, 0.0)[:, None])
-        first = predict(o.first, o.sample, now, m, (earlier, beta))
-        jam_before, jam_now = (s._replace(delta=np.where(active, o.held, s.delta)) for s in (o.sample, now))
-        second = predict(o.second, jam_before, jam_now, m, None)
-        if not o.begun.all():  # the first sample of an episode: its filters start there
-            first, second = (begin(f, o.begun, now) for f in (first, second))
-        first, told = update(first, now.y, R)
-        second, told_jammed = update(second, now.y, R)
+        return (on < k[:, None]) & (k[:, None] <= end)
+
+    def begin(o: Told, at: Interval, y: Array) -> Told:
+        now, x = model.known(at, o.known), y[:, :2]
+        o = o._replace(known=now, first=o.first._replace(x=x), second=o.second._replace(x=x), jam=now.delta)
+        return observe(o, at, y, np.ones(y.shape, bool))
+
+    def forward(o: Told, at: Interval) -> Told:
+        now, within = model.known(at, o.known), inside(o, at.k)
+        active = np.asarray(within.any(axis=1))
+        since = np.where(active, at.k - np.where(within, o.windows[..., 0], 0).max(axis=1), 0) * DT
+        earlier, beta = (1 - np.exp(-p.rates * np.maximum(t, 0.0)[:, None]) for t in (since - DT, since))
+        first = predict(o.first, o.known, now, m, (earlier, beta))
+        before, after = (known._replace(delta=np.where(active, o.jam, known.delta)) for known in (o.known, now))
+        return o._replace(known=now, first=first, second=predict(o.second, before, after, m, None))
+
+    def observe(o: Told, at: Interval, y: Array, seen: Array) -> Told:
+        k, within, (on, end) = at.k, inside(o, at.k), np.moveaxis(o.windows, 2, 0)
+        active, opens = np.asarray(within.any(axis=1)), np.asarray((on == k[:, None]).any(axis=1))
+        settled = ~(active | ((end < k[:, None]) & (k[:, None] <= end + SETTLE)).any(axis=1))
+        first, told = update(o.first, y[:, :2], seen[:, :2], R)
+        second, told_jammed = update(o.second, y[:, :2], seen[:, :2], R)
         rho_only = Information(told.A[:, :m, :m], told.b[:, :m], told.c)
         free = o.free.add(rho_only, settled)
         window = o.window.keep(~opens).add(told, active)
@@ -248,35 +278,24 @@ def innovation_oracle(
             first = first._replace(s=np.where(fresh, clean, first.s))
             second = Tracked(np.where(opens[:, None], first.x, second.x), np.where(fresh, first.P, second.P),
                              np.where(fresh, first.s[..., :m], second.s))  # fmt: skip
-        said = o.said
-        if k % every == 0 and active.any():
-            said = answer(evidence(free, window, jammed, beta, p))
-        said = silent(said, active)
-        held = np.where(opens, now.delta, o.held)
-        return Oracle(k + 1, np.ones(len(obs), bool), o.windows, now, first, second, held, free, window, jammed, said), said
+        log, size, due = o.log, o.size, active & (k % every == 0)
+        if due.any():
+            since = np.where(active, k - np.where(within, on, 0).max(axis=1), 0) * DT
+            found = evidence(free, window, jammed, 1 - np.exp(-p.rates * since[:, None]), p)
+            candidates = found.log if none_allowed else np.where(np.arange(6) == 0, -np.inf, found.log)
+            log, size = np.where(due[:, None], candidates, log), np.where(due[:, None], found.size, size)
+        log = np.where(active[:, None], log, certain)  # outside the windows the answer is none
+        return Told(
+            o.windows, o.known, first, second, np.where(opens, o.known.delta, o.jam), free, window, jammed, log, size
+        )
 
-    def answer(found: Evidence) -> Diagnosis:
-        log = found.log.copy()
-        if not none_allowed:
-            log[:, 0] = -np.inf
-        mode = np.argmax(log, axis=1)
-        theta = np.zeros((len(mode), 5))
-        for i, label in enumerate(LINEAR):
-            theta[:, label - 1] = np.where(mode == label, found.size[:, i], 0.0)
-        theta[:, 3] = mode == 4
-        probs = np.exp(log - logsumexp(log, axis=1, keepdims=True))
-        return Diagnosis(mode > 0, mode, theta, None, probs)
+    def read(o: Told) -> Reading:
+        probs = np.exp(o.log - logsumexp(o.log, axis=1, keepdims=True))
+        label, z = np.argmax(o.log, axis=1), np.zeros((len(probs), 5))
+        for i, l in enumerate(LINEAR):  # noqa: E741
+            z[:, l - 1] = np.where(label == l, o.size[:, i], 0.0)
+        z[:, 3] = label == 4
+        return Reading(z, cost=-2.0 * o.log, probs=probs)
 
-    def silent(said: Diagnosis, active: Array) -> Diagnosis:
-        """Outside the windows the answer is none."""
-        none = np.eye(6)[np.zeros(len(active), int)]
-        assert said.estimate is not None
-        assert said.label_probs is not None
-        return Diagnosis(said.alarm & active, np.where(active, said.label, 0), said.estimate * active[:, None], None,
-                         np.where(active[:, None], said.label_probs, none))  # fmt: skip
-
-    def begin(f: Tracked, begun: Array, sample: Sample) -> Tracked:
-        mask = begun[:, None, None]
-        return Tracked(np.where(begun[:, None], f.x, sample.y), np.where(mask, f.P, R), np.where(mask, f.s, 0.0))
-
-    return Diagnoser(init, observe)
+    filter = Filter(start, forward, observe, read, True, begin, model.SENSORS)
+    return diagnoser_of(plant, filter, most_probable())
