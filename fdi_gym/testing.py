@@ -289,8 +289,8 @@ def check_diagnoser(
 ) -> None:
     """Shapes, determinism, batch independence, no look-ahead, and gaps in the measurement.
 
-    A method that handles gaps must stay quiet through them and keep its accuracy; the others, which the guard holds, must not
-    be lost.
+    A method that handles gaps must stay quiet through them and keep its accuracy; the others, which the guard holds, must
+    not be lost.
 
     Args:
         build: Makes the diagnoser from the plant; the scenarios are for clairvoyant ones.

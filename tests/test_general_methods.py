@@ -237,7 +237,9 @@ def test_oracle_is_told_when_and_not_what(plant):
     if single:
         other = next(mode.name for mode in plant.modes if mode.name != scenarios[single[0]].faults[0].mode)
         lie = [
-            s if i != single[0] else s.replace(faults=[type(s.faults[0])(other, "", s.faults[0].onset, [], s.faults[0].end)])
+            s
+            if i != single[0]
+            else s.replace(faults=[type(s.faults[0])(other, "", s.faults[0].onset, s.faults[0].effects, s.faults[0].end)])
             for i, s in enumerate(scenarios)
         ]
         again = run(make_diagnoser("told_onset_ekf", plant, scenarios=lie), record.obs[:, :400])

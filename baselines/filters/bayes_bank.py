@@ -146,7 +146,7 @@ def bayes_bank(
         NotApplicableError: Another plant.
     """
     check(plant)
-    f, sizes = kalman_filter.nominal_filter(plant), Sizes(tuple(gamma), tuple(b_max))
+    f, sizes = kalman_filter.nominal_filter(plant), Sizes((gamma[0], gamma[1]), (b_max[0], b_max[1]))
     T = len(range(first_onset, last_onset + 1, grid))
     each = np.log(p_fault / T)
 

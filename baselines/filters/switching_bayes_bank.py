@@ -103,7 +103,7 @@ def switching_bayes_bank(
         NotApplicableError: Another plant.
     """
     check(plant)
-    f, sizes = kalman_filter.nominal_filter(plant), Sizes(tuple(gamma), tuple(b_max))
+    f, sizes = kalman_filter.nominal_filter(plant), Sizes((gamma[0], gamma[1]), (b_max[0], b_max[1]))
 
     def start(n: int) -> Switching:
         return Switching(

@@ -55,7 +55,7 @@ def known_onset_oracle(
         ValueError (from init): The number of episodes is not that of the scenarios.
     """
     check(plant)
-    f, sizes = kalman_filter.nominal_filter(plant), Sizes(tuple(gamma), tuple(b_max))
+    f, sizes = kalman_filter.nominal_filter(plant), Sizes((gamma[0], gamma[1]), (b_max[0], b_max[1]))
     steps = max((s.steps for s in scenarios), default=1)
     active, begins = (np.zeros((len(scenarios), steps + 1), bool) for _ in range(2))
     for i, scenario in enumerate(scenarios):

@@ -306,6 +306,6 @@ def by_channels(plant: Plant, inputs: FaultInputs, alpha: float, thresholds: Arr
         flagged = declared.label > 0
         label = label_of_channels(labels, sets, flagged, size / J)
         signals = {"smoothed": smooth, "channels_on": flagged}
-        return (smooth, declared), Verdict(flagged.any(axis=1), label, None, Evidence(channels=size), signals)
+        return (smooth, declared), Verdict(np.any(flagged, axis=1), label, evidence=Evidence(channels=size), signals=signals)
 
     return Rule(start, step)
