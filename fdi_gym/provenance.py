@@ -21,7 +21,7 @@ from typing import Any
 import platformdirs
 
 from fdi_gym.diagnosis import diagnosers, find_diagnoser, make_diagnoser
-from fdi_gym.diagnosis.fit import knowledge_of
+from fdi_gym.diagnosis.knowledge import knowledge_of
 from fdi_gym.estimation.data import digest
 from fdi_gym.faults import draw
 from fdi_gym.metrics import outcome

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdi_gym.diagnosis import filtering, fit
+from fdi_gym.diagnosis import filtering, fitting, knowledge
 from fdi_gym.estimation.decision import Rule, Verdict
 from fdi_gym.plant import Plant, load_plant, plant_sources
 from fdi_gym.simulation import simulate
@@ -42,21 +42,21 @@ def motor() -> Plant:
 @pytest.fixture
 def short_calibrations(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fits from four flights of at most 100 samples, none of them shipped or kept: for tests that don't count alarms."""
-    real = fit.flights_of
+    real = fitting.flights_of
 
     def short(plant, process, first, count, faults):
         scenarios, record = real(plant, process, first, min(count, 4), faults)
-        if first == fit.FIRST:
+        if first == fitting.FIRST:
             scenarios = [s.replace(steps=min(s.steps, 100)) for s in scenarios]
             record = simulate(plant, scenarios)
         return scenarios, record
 
-    monkeypatch.setattr(fit, "flights_of", short)
-    monkeypatch.setattr(fit, "FLIGHTS", 4)
-    monkeypatch.setattr(fit, "CHANNEL_FLIGHTS", 4)
-    monkeypatch.setattr(fit, "_kept", {})
-    monkeypatch.setattr(fit, "fits_file", lambda folder, plant_id: None)
-    monkeypatch.setattr(fit, "cache_folder", lambda source: None)
+    monkeypatch.setattr(fitting, "flights_of", short)
+    monkeypatch.setattr(fitting, "FLIGHTS", 4)
+    monkeypatch.setattr(fitting, "CHANNEL_FLIGHTS", 4)
+    monkeypatch.setattr(knowledge, "_kept", {})
+    monkeypatch.setattr(knowledge, "fits_file", lambda folder, plant_id: None)
+    monkeypatch.setattr(knowledge, "cache_folder", lambda source: None)
 
 
 SILENT = Rule(lambda n: np.zeros(n), lambda s, k, r, informed: (s, Verdict(s > 0, s.astype(int))))

@@ -1,6 +1,5 @@
 """The filters that need nothing but a plant's declaration: model, belief, filters, decisions, calibration."""
 
-import inspect
 import itertools
 
 import msgspec
@@ -12,8 +11,8 @@ from scipy.stats import betabinom
 
 from baselines.filters import augmented_kf, two_stage_kf
 from baselines.filters.augmented_gaussian import gaussian_filter
-from fdi_gym.diagnosis import NotApplicableError, diagnosers, fit, make_diagnoser, run
-from fdi_gym.diagnosis.fit import VALIDATION_SEED, fit_belief, flights_of, long_run
+from fdi_gym.diagnosis import NotApplicableError, diagnosers, fit, fitting, knowledge, make_diagnoser, run
+from fdi_gym.diagnosis.fitting import VALIDATION_SEED, fit_belief, flights_of, long_run
 from fdi_gym.estimation.augmented import Interval, augmented
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration, Persistence, gain
@@ -243,12 +242,7 @@ def test_measured_disturbance_of_the_missile():
 @pytest.fixture
 def few_flights(monkeypatch):
     """Beliefs from four flights; none is kept."""
-    monkeypatch.setattr(fitting_module(), "FLIGHTS", 4)
-
-
-def fitting_module():
-    """The module, which the package's function of the same name hides."""
-    return inspect.getmodule(fit_belief)
+    monkeypatch.setattr(fitting, "FLIGHTS", 4)
 
 
 @pytest.mark.parametrize(("plant_id", "process"), [*((p, "fault-free") for p in ALL_PLANTS), ("B747Lateral", "hard"),
@@ -264,7 +258,7 @@ def test_noise_of_a_belief_is_the_declared_one_and_the_models_errors(few_flights
         more = p.Q - plant.Q
         assert np.linalg.eigvalsh(more).min() >= -1e-8 * np.abs(more).max()
         assert np.linalg.eigvalsh(p.R - R).min() >= -1e-8 * np.abs(R).max()
-        floor = (fitting_module().FLOOR * np.array([state.scale for state in plant.states])) ** 2
+        floor = (fitting.FLOOR * np.array([state.scale for state in plant.states])) ** 2
         assert (np.diag(more) > 2 * floor).any()
     else:
         assert p.Q[np.ix_(noisy, noisy)] == pytest.approx(plant.Q[np.ix_(noisy, noisy)], rel=1e-8)
@@ -293,17 +287,17 @@ def test_long_run_of_white_noise_is_its_covariance_and_of_a_constant_grows_with_
 
 
 def test_seeds_are_those_of_validation(monkeypatch, few_flights, motor):
-    module, seeds, stage = fitting_module(), {}, "belief"
+    seeds, stage = {}, "belief"
 
     def noted(process, seed, *rest):
         seeds.setdefault(stage, set()).add(seed)
         return draw(process, seed, *rest)
 
-    monkeypatch.setattr(module, "draw", noted)
+    monkeypatch.setattr(fitting, "draw", noted)
     fit_belief(motor, "standard")
     stage = "calibration"
-    module._healthy(motor, "standard")
-    module._healthy(motor, "standard", module.CHANNEL_FLIGHTS)
+    fitting._healthy(motor, "standard")
+    fitting._healthy(motor, "standard", fitting.CHANNEL_FLIGHTS)
     assert len(seeds["belief"]) == 4
     assert 20 <= len(seeds["calibration"]) <= 100
     assert not seeds["belief"] & seeds["calibration"]
@@ -496,8 +490,8 @@ def test_share_of_flights_with_a_false_alarm_is_the_rate(monkeypatch, b747):
     """On fresh flights. The threshold is the r-th smallest of N healthy flights' statistics, so the probability that a
     fresh flight exceeds it is Beta(N - r + 1, r), and the number that do is beta-binomial: calibration's own sampling
     error is in the interval."""
-    module, N, fresh, rate = fitting_module(), 30, 60, 0.05
-    monkeypatch.setattr(module, "SAMPLES", N * 1200)
+    N, fresh, rate = 30, 60, 0.05
+    monkeypatch.setattr(fitting, "SAMPLES", N * 1200)
     belief, calibration = fit("augmented_ukf", b747)
     diagnoser = diagnosers()["augmented_ukf"].build(b747, belief, calibration, rule="unscented")
     obs = flights_of(b747, "standard", 800_000, fresh, False)[1].obs
@@ -509,10 +503,10 @@ def test_share_of_flights_with_a_false_alarm_is_the_rate(monkeypatch, b747):
 
 
 def test_fits_are_kept_and_what_made_them_tells_them_apart(monkeypatch, tmp_path, motor):
-    module, calls, entry = fitting_module(), [], diagnosers()["augmented_ekf"]
-    monkeypatch.setattr(module, "fits_file", lambda folder, plant_id: None)
-    monkeypatch.setattr(module, "_kept", {})
-    monkeypatch.setattr(module, "cache_folder", lambda source: tmp_path)
+    calls, entry = [], diagnosers()["augmented_ekf"]
+    monkeypatch.setattr(knowledge, "fits_file", lambda folder, plant_id: None)
+    monkeypatch.setattr(knowledge, "_kept", {})
+    monkeypatch.setattr(knowledge, "cache_folder", lambda source: tmp_path)
     made = Calibration(thresholds={"worn brush": 2.0})
 
     def make():
@@ -521,8 +515,8 @@ def test_fits_are_kept_and_what_made_them_tells_them_apart(monkeypatch, tmp_path
 
     def ask(plant=motor, key="a", forget=False):
         if forget:
-            module._kept.clear()
-        assert digest(module._known(entry, plant, "calibrations", key, make)) == digest(made)
+            knowledge._kept.clear()
+        assert digest(knowledge._known(entry, plant, "calibrations", key, make)) == digest(made)
         return len(calls)
 
     assert [ask(), ask(), ask(forget=True)] == [1, 1, 1]  # made, in memory, on disk
@@ -531,7 +525,7 @@ def test_fits_are_kept_and_what_made_them_tells_them_apart(monkeypatch, tmp_path
     assert ask(forget=True) == 2
     assert ask(key="b") == 3
     assert ask(plant=build("B747Lateral")) == 4
-    monkeypatch.setattr(module, "code_digest", lambda plant: "edited")
+    monkeypatch.setattr(knowledge, "code_digest", lambda plant: "edited")
     assert ask() == 5
 
 
@@ -549,8 +543,8 @@ def test_builders_fly_nothing_and_say_why_they_cannot(monkeypatch, plant_id, nam
     def fly(*_):
         raise AssertionError("a builder flies")
 
-    monkeypatch.setattr(fitting_module(), "simulate", fly)
-    monkeypatch.setattr(fitting_module(), "flights_of", fly)
+    monkeypatch.setattr(fitting, "simulate", fly)
+    monkeypatch.setattr(fitting, "flights_of", fly)
     reason = ""
     try:
         entry.build(plant, **given, **entry.resolve(plant))

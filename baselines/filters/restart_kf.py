@@ -58,7 +58,7 @@ def restart_kf(
 
     def update(s: Restarted, at: Interval, y: Array, seen: Array) -> Restarted:
         first, other = (f.update(part, at, y, seen) for f, part in ((detector, s.detector), (second, s.second)))
-        decision, verdict = rule.step(s.decision, at.k, detector.read(first), seen.any(axis=1))
+        decision, verdict = rule.step(s.decision, at.k, detector.read(first), np.asarray(seen.any(axis=1)))
         rises = verdict.alarm & ~s.alarm
         if rises.any():
             fresh = start(len(y), len(plant.outputs), P_x, P_z)._replace(x=first.state(), Px=first.covariance())

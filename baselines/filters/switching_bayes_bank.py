@@ -8,6 +8,7 @@ cuts the transient of a recovery after 4 s, so the optimum of a causal diagnoser
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from baselines.filters import kalman_filter
 from baselines.filters.bayes_bank import LOG_WEIGHT, Sizes, check, label_probabilities, marginals, most_probable
 from baselines.filters.kalman_filter import Healthy, sense
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
+from fdi_gym.diagnosis.contract import map_arrays
 from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading
 from fdi_gym.plant import Array, Plant
@@ -132,18 +134,18 @@ def switching_bayes_bank(
         whole = [a.copy() for a in (s.M, s.G, s.g, s.u_onset, s.w)]
         for a, new in zip(whole, (*moved, w), strict=True):
             a[:, : new.shape[1]] = new
-        return Switching(s.healthy, w_healthy + np.log1p(-P_BEGIN), *whole, s.probs, s.z)
+        M, G, g, u_onset, w = whole
+        return Switching(s.healthy, w_healthy + np.log1p(-P_BEGIN), M, G, g, u_onset, w, s.probs, s.z)
 
-    def by_clock(function, s: Switching, at: Interval, *arrays: Array) -> Switching:  # type: ignore[no-untyped-def]
+    def by_clock(function: Callable[..., Switching], s: Switching, at: Interval, *arrays: Array) -> Switching:
         """Apply to the episodes of each sample number together: there is one, but for episodes that began later."""
         if (at.k == at.k[0]).all():
             return function(s, int(at.k[0]), *arrays)
-        out = Switching(*(a if isinstance(a, Healthy) else a.copy() for a in s))
+        out = map_arrays(np.copy, s)
         for k in np.unique(at.k):
             rows = at.k == k
-            part = function(_rows(s, rows), int(k), *(a[rows] for a in arrays))
-            for whole, new in zip(out[1:], part[1:], strict=True):
-                whole[rows] = new
+            part = function(map_arrays(lambda a, rows=rows: a[rows], s), int(k), *(a[rows] for a in arrays))
+            map_arrays(lambda whole, new, rows=rows: whole.__setitem__(rows, new), out, part)
         return out
 
     def predict(s: Switching, at: Interval) -> Switching:
@@ -183,7 +185,3 @@ def switching_bayes_bank(
         return Reading(s.z, x=s.healthy.x, Px=s.healthy.P, nu=s.healthy.nu, probs=s.probs)
 
     return diagnoser_of(plant, Filter(start, predict, update, read, first_sample=False), most_probable())
-
-
-def _rows(s: Switching, rows: Array) -> Switching:
-    return Switching(Healthy(*(a[rows] for a in s.healthy)), *(a[rows] for a in s[1:]))

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from fdi_gym.diagnosis import make_diagnoser
-from fdi_gym.diagnosis.filtering import watch
-from fdi_gym.diagnosis.fit import flights_of
+from fdi_gym.diagnosis.filtering import readings
+from fdi_gym.diagnosis.fitting import flights_of
 from fdi_gym.estimation.kalman import quadratic
 from fdi_gym.plant import Plant
 
@@ -40,8 +40,8 @@ def measure(plant: Plant, process: str, name: str) -> dict[str, dict[str, float 
     last = min(SAMPLES, int(record.length.min()))
     found: dict[str, list[float]] = {"NIS": [], "NEES": []}
     dimension = {"NEES": len(plant.states), "NIS": 0}
-    readings = watch(plant, make_diagnoser(name, plant, process=process), record.obs[:, : last + 1])
-    for k, (r, _) in enumerate(readings):
+    said = readings(plant, make_diagnoser(name, plant, process=process), record.obs[:, : last + 1])
+    for k, (r, _) in enumerate(said):
         if k > 0 and r.nu is not None and r.S is not None and r.x is not None and r.Px is not None:
             dimension["NIS"] = r.nu.shape[1]
             found["NIS"].append(float(quadratic(r.nu, r.S).mean()))

@@ -2,7 +2,7 @@
 
 from fdi_gym.diagnosis.contract import Decisions, Diagnoser, Diagnosis, run
 from fdi_gym.diagnosis.filtering import Filter, diagnoser_of
-from fdi_gym.diagnosis.fit import fit
+from fdi_gym.diagnosis.fitting import fit
 from fdi_gym.diagnosis.guard import guarded
 from fdi_gym.diagnosis.registry import Entry, broken_plugins, diagnoser, diagnosers, find_diagnoser, make_diagnoser
 from fdi_gym.plant import NotApplicableError

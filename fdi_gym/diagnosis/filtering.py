@@ -112,7 +112,7 @@ def diagnoser_of(plant: Plant, filter: Filter, rule: Rule) -> Diagnoser:
     return Diagnoser(lambda n: _start(plant, filter, rule, n), update, gaps=True, filter=filter, rule=rule)
 
 
-def watch(plant: Plant, diagnoser: Diagnoser, obs: Array) -> Iterator[tuple[Reading, Verdict]]:
+def readings(plant: Plant, diagnoser: Diagnoser, obs: Array) -> Iterator[tuple[Reading, Verdict]]:
     """What the filter and the rule of a diagnoser say at each sample of recorded observations (N, K + 1, n_obs)."""
     s = _start(plant, diagnoser.filter, diagnoser.rule, len(obs))
     for k in range(obs.shape[1]):

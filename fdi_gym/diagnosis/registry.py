@@ -8,9 +8,9 @@ A builder makes a diagnoser from a plant and from data; it flies nothing and rea
     @diagnoser("augmented_ekf", "Augmented extended Kalman filter")
     def augmented_ekf(plant: Plant, belief: Belief, calibration: Calibration, *, walk: float = 1.0) -> Diagnoser: ...
 
-Arguments of these names are given: `belief` and `calibration` are what `fdi_gym.diagnosis.fit` found for the fault process
-that will be met, `process` is that process's name, `scenarios` the truth, for ceilings only. All others are tuning. Builders
-in the modules and packages of the entry-point group "fdi_gym.diagnosers" are discovered; none is listed.
+Arguments of these names are given: `belief` and `calibration` are what `fdi_gym.diagnosis.fitting` found for the fault
+process that will be met, `process` is that process's name, `scenarios` the truth, for ceilings only. All others are tuning.
+Builders in the modules and packages of the entry-point group "fdi_gym.diagnosers" are discovered; none is listed.
 """
 
 from __future__ import annotations
@@ -190,7 +190,7 @@ def make_diagnoser(
 ) -> Diagnoser:
     """A diagnoser by name, for a plant and one of its fault processes, under the guard (see `guarded`).
 
-    What it believes and when it alarms is what `fdi_gym.diagnosis.fit` found for that process: shipped where it is, else
+    What it believes and when it alarms is what `fdi_gym.diagnosis.fitting` found for that process: shipped where it is, else
     found when it is first asked for.
 
     Args:
@@ -203,7 +203,7 @@ def make_diagnoser(
     Raises:
         ValueError: Unknown name, process or keyword; `NotApplicableError` where the method cannot run on this plant.
     """
-    from fdi_gym.diagnosis.fit import knowledge_of
+    from fdi_gym.diagnosis.knowledge import knowledge_of
 
     entry = find_diagnoser(name)
     plant.process(process)

@@ -2,7 +2,7 @@
 
 One rate of false alarms for every method, whatever its statistic: what it takes to keep quiet on all but a small share of
 healthy flights is its threshold. The truth may lie off the model there as it will in the test, so a method that is too
-sure of itself is given the thresholds that this costs. `fdi_gym.diagnosis.fit` flies those flights.
+sure of itself is given the thresholds that this costs. `fdi_gym.diagnosis.fitting` flies those flights.
 """
 
 from __future__ import annotations

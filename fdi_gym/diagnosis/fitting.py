@@ -2,35 +2,24 @@
 
 `fit(method, plant, process)` gives a `Belief` (what a filter may assume of the plant, from its declaration and from flights
 of the process) and a `Calibration` (thresholds that 5 % of its healthy flights reach). All flights have validation seeds.
-Nothing of a test flight is used. `<package of the method>/fits/<Plant>.json` holds the shipped ones; they are valid as long
-as the plant's code is the one that they were made from. Others are made when they are first asked for, and kept.
+Nothing of a test flight is used. `fdi_gym.diagnosis.knowledge` ships and keeps what is found.
 """
 
 from __future__ import annotations
 
-import ast
-import functools
-import hashlib
-import importlib
-import inspect
-import json
-import os
-import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from fdi_gym.diagnosis.filtering import watch
-from fdi_gym.diagnosis.registry import Entry, find_diagnoser, package_of
+from fdi_gym.diagnosis.filtering import readings
+from fdi_gym.diagnosis.registry import Entry, find_diagnoser
 from fdi_gym.estimation.belief import Belief, fault_inputs, noisy_sensors
 from fdi_gym.estimation.calibration import Calibration, thresholds_from
-from fdi_gym.estimation.data import from_json, rounded, to_json
+from fdi_gym.estimation.data import rounded
 from fdi_gym.faults import FaultScenario, draw
-from fdi_gym.kernels import cache_folder
-from fdi_gym.plant import Array, Plant, plant_sources
+from fdi_gym.plant import Array, Plant
 from fdi_gym.simulation import Record, simulate
 
 VALIDATION_SEED = 2_000_000
@@ -179,7 +168,7 @@ def _healthy(plant: Plant, process: str, count: int | None = None) -> Record:
 def _excess(plant: Plant, build: Any, record: Record) -> Array | None:
     """By how much the spread of a healthy estimate exceeds the filter's own covariance (p, p); zero if it does not."""
     own, found, count = 0.0, 0.0, 0
-    for k, (reading, _) in enumerate(watch(plant, build(Calibration()), record.obs)):
+    for k, (reading, _) in enumerate(readings(plant, build(Calibration()), record.obs)):
         if reading.cost is not None or reading.P is None or reading.z is None:
             return None
         flown = (k <= record.length) & np.isfinite(reading.z).all(axis=1)
@@ -198,10 +187,10 @@ def fit_calibration(
     def build(calibration: Calibration) -> Any:
         return entry.build(plant, calibration=calibration, **given, **settings)
 
-    first = next(watch(plant, build(Calibration()), _healthy(plant, process, 1).obs))[1].evidence
+    first = next(readings(plant, build(Calibration()), _healthy(plant, process, 1).obs))[1].evidence
     if first.channels is not None:
         record, most = _healthy(plant, process, CHANNEL_FLIGHTS), np.zeros((CHANNEL_FLIGHTS, first.channels.shape[1]))
-        for k, (_, verdict) in enumerate(watch(plant, build(Calibration()), record.obs)):
+        for k, (_, verdict) in enumerate(readings(plant, build(Calibration()), record.obs)):
             found = np.asarray(verdict.evidence.channels)
             np.maximum(most, np.where((k <= record.length)[:, None], found, 0.0), out=most)
         names = fault_inputs(plant, settings.get("channels")).names
@@ -211,7 +200,7 @@ def fit_calibration(
     n, samples, _ = record.obs.shape
     silent = Calibration(excess=_excess(plant, build, record))
     cost, rise = np.zeros((n, samples, len(plant.labels))), None
-    for k, (_, verdict) in enumerate(watch(plant, build(silent), record.obs)):
+    for k, (_, verdict) in enumerate(readings(plant, build(silent), record.obs)):
         now = np.asarray(verdict.evidence.cost)
         flown = (k <= record.length) & np.isfinite(now).all(axis=1)
         cost[:, k] = np.where(flown[:, None], now, cost[:, max(k - 1, 0)])
@@ -245,110 +234,3 @@ def fit(
     settings = entry.resolve(plant, **tuning)
     belief = fit_belief(plant, process) if entry.takes("belief") else None
     return belief, fit_calibration(entry, plant, process, settings, belief) if entry.takes("calibration") else None
-
-
-# ---------------------------------------------------------------------------------------------------------------
-# What is shipped, and what is kept
-
-
-class Fits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The file of a plant: beliefs and calibrations by what they were made for, and the digest of the plant's code."""
-
-    plant: str
-    code: str
-    beliefs: dict[str, Belief] = {}
-    calibrations: dict[str, Calibration] = {}
-
-
-def code_digest(plant: Plant) -> str:
-    """Digest of the plant's file, comments and docstrings aside; "" for a plant that no file declares."""
-    source = plant_sources().get(plant.id)
-    file = getattr(importlib.import_module(source.builder.split(":")[0]), "__file__", None) if source else None
-    return _code_digest(Path(file)) if file else ""
-
-
-@functools.cache
-def _code_digest(path: Path) -> str:
-    tree = ast.parse(path.read_bytes())
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list) and body and isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):
-            body[0].value = ast.Constant("")
-    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:16]
-
-
-def belief_key(plant: Plant, process: str) -> str:
-    """What a belief was made for."""
-    return json.dumps([process, dict(plant.options)], sort_keys=True)
-
-
-def calibration_key(entry: Entry, plant: Plant, process: str, settings: Mapping[str, Any]) -> str:
-    """What a calibration was made for."""
-    return json.dumps([entry.name, process, dict(plant.options), dict(settings)], sort_keys=True, default=list)
-
-
-@functools.cache
-def fits_file(folder: Path, plant_id: str) -> Fits | None:
-    """The shipped fits of a plant in a package's folder; None where there are none, or the file is no such file."""
-    path = folder / "fits" / f"{plant_id}.json"
-    try:
-        return from_json(path.read_bytes(), Fits) if path.is_file() else None
-    except (OSError, ValueError) as error:
-        print(f"fdi_gym: {path} is not used: {error}", file=sys.stderr)
-        return None
-
-
-_kept: dict[str, Any] = {}
-
-
-def _known(entry: Entry, plant: Plant, kind: str, key: str, make: Any) -> Any:
-    code = code_digest(plant)
-    home = package_of(entry)
-    shipped = fits_file(home, plant.id) if home else None
-    if shipped is not None and shipped.code == code:
-        found = getattr(shipped, kind).get(key)
-        if found is not None:
-            return found
-    place = f"{plant.env_id} {code} {kind} {key}"
-    if place not in _kept:
-        _kept[place] = _on_disk(entry, place, Belief if kind == "beliefs" else Calibration, make)
-    return _kept[place]
-
-
-def _on_disk(entry: Entry, place: str, of: Any, make: Any) -> Any:
-    """What an earlier session found with the same sources, else what is found now; a damaged file is made again."""
-    folder = cache_folder(inspect.getfile(entry.build))
-    if folder is None:
-        return make()
-    path = folder / f"fit-{hashlib.sha256(place.encode()).hexdigest()[:24]}.json"
-    try:
-        return from_json(path.read_bytes(), of)
-    except (OSError, ValueError):
-        found = make()
-    part = path.with_suffix(f".{os.getpid()}.part")
-    try:
-        part.write_bytes(to_json(found))
-        part.replace(path)
-    except OSError:
-        part.unlink(missing_ok=True)
-    return found
-
-
-def knowledge_of(entry: Entry, plant: Plant, process: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The belief and the calibration that a method's builder takes: shipped, or found now and kept for the session."""
-    found: dict[str, Any] = {}
-    if entry.takes("belief"):
-        found["belief"] = _known(entry, plant, "beliefs", belief_key(plant, process), lambda: fit_belief(plant, process))
-    if entry.takes("calibration"):
-        key = calibration_key(entry, plant, process, settings)
-        found["calibration"] = _known(
-            entry, plant, "calibrations", key,
-            lambda: fit_calibration(entry, plant, process, settings, found.get("belief")),
-        )  # fmt: skip
-    return found
-
-
-def write_fits(path: Path, fits: Fits) -> None:
-    """Write a plant's file, indented for readers."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(msgspec.json.format(to_json(fits), indent=1) + b"\n")
