@@ -259,6 +259,19 @@ def test_a_fault_without_duration_does_nothing(plant):
             assert (record.label == 0).all()
 
 
+@pytest.mark.parametrize("wrong", ["x", "u", "theta", "d", "p"])
+def test_the_model_refuses_arrays_of_other_widths(plant, wrong):
+    widths = dict(zip(["x", "u", "theta", "d", "p"], (plant.states, plant.commands, plant.theta, plant.disturbances,
+                                                 plant.nominal_p), strict=True))  # fmt: skip
+    good = {name: np.zeros((6, len(vector))) for name, vector in widths.items()}
+    n = len(widths[wrong])
+    for shape in ((6, n + 1), (6, max(n - 1, 0)), (4, n), (12, n), (0, n)):
+        if shape != (6, n) and not (wrong == "x" and shape in ((12, n), (0, n))):
+            with pytest.raises(ValueError, match=r"columns and rows|t is one"):
+                plant.propagate(np.zeros(6), **{**good, wrong: np.zeros(shape)})
+    assert plant.propagate(0.0, **{name: a[:0] for name, a in good.items()}).shape == (0, len(plant.states))
+
+
 # -- declarations
 
 
