@@ -36,7 +36,12 @@ from fdi_gym.simulation import no_noise, simulate
 from fdi_gym.testing import _check_range, check_plant
 
 NAN, INF = math.nan, math.inf
-EVERY = [*PLANTS, "DCMotor"]
+VARIANTS = (
+    ("B747Lateral", {"variant": "bare/closed", "labels": "dual"}), ("MissilePitch", {"fault_scale": 2.0}),
+    ("HUAVHover", {"kappa": 1.0}), ("CMGSatellite", {"reference": "regulate", "steering": "pinv", "fault_model": "wheel"}),
+    ("CMGSatellite", {"excitation": "null", "feedback": "true"}),
+)  # fmt: skip
+EVERY = (*((plant_id, {}) for plant_id in (*PLANTS, "DCMotor")), *VARIANTS)
 
 
 def flight(plant, seed=0, steps=30, process="standard"):
@@ -561,11 +566,12 @@ def fuzz(calls, seed):
     drawn = {}
     flown = refused = 0
     for _ in range(calls):
-        plant = build(EVERY[rng.integers(len(EVERY))])
+        plant_id, options = EVERY[rng.integers(len(EVERY))]
+        plant = build(plant_id, **options)
         name = list(plant.processes)[rng.integers(len(plant.processes))]
-        key = plant.id, name, int(rng.integers(6))
+        key = plant.id, str(options), name, int(rng.integers(6))
         if key not in drawn:
-            scenario = draw(plant.process(name), key[2])
+            scenario = draw(plant.process(name), key[3])
             steps = 40
             faults = [
                 Fault(f.mode, f.kind, f.onset * steps // scenario.steps, [
