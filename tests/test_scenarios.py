@@ -407,7 +407,7 @@ def test_check_plant_finds_and_names_a_wrong_declaration(plant, what):
     if what == "the sign of the reach" and all(m.reach[0] * m.reach[1] < 0 for m in plant.modes):
         pytest.skip("all its modes reach to both sides")
     with pytest.raises((AssertionError, ValueError), match=match):
-        check_plant(dataclasses.replace(plant, **change(plant)), seeds=range(12))
+        check_plant(dataclasses.replace(plant, **change(plant)), seeds=range(2 if what == "linear" else 12))
 
 
 def test_check_plant_names_the_sensor_that_is_not_finite(motor):
