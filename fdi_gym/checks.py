@@ -200,6 +200,6 @@ def _check_effect(plant: Plant, where: str, effect: Effect) -> None:
             raise TypeError(f"{where}: an unknown effect {effect!r}")
     if not entry.low <= low <= high <= entry.high:
         raise ValueError(
-            f"{where}: {entry.name} lies within [{entry.low:g}, {entry.high:g}], where {type(effect).__name__} would bring "
-            f"it to {low:g}" + (f" to {high:g}" if high > low else "")
+            f"{where}: theta's {entry.name} lies within [{entry.low:g}, {entry.high:g}], where {type(effect).__name__} "
+            f"would bring it to {low:g}" + (f" to {high:g}" if high > low else "")
         )

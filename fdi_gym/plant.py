@@ -457,16 +457,27 @@ class Plant:
 
     def _rows_of(self, t: Any, x: Array, u: Array, theta: Any, d: Any, p: Any, width: int) -> tuple[Array, ...]:
         """The arguments of a generic kernel from those of `propagate`, and an array for its output."""
-        points = contiguous(x.reshape(-1, x.shape[-1]))
-        return (
-            contiguous(np.atleast_1d(t)),
+        points = contiguous(x.reshape(math.prod(x.shape[:-1]), x.shape[-1] if x.ndim else 1))
+        rows = (
             points,
             self._rows(u, self.trim_command),
             self._rows(theta, self.nominal_theta),
             self._rows(d, np.zeros(len(self.disturbances))),
             self._rows(p, self.nominal_p),
-            np.empty((points.shape[0], width)),
         )
+        times = contiguous(np.ravel(t))
+        for name, a, n in zip(("x", "u", "theta", "d", "p"), rows, self._widths, strict=True):
+            if a.shape[1] != n or (len(points) % len(a) if len(a) else len(points)):
+                raise ValueError(f"{name} has {n} columns and rows that serve the {len(points)} points alike, not {a.shape}")
+        if len(points) % times.size if times.size else len(points):
+            raise ValueError(f"t is one number, or serves the {len(points)} points alike, not {times.size} numbers")
+        return times, *rows, np.empty((len(points), width))
+
+    @functools.cached_property
+    def _widths(self) -> tuple[int, ...]:
+        """Of x, u, theta, d and p."""
+        vectors = (self.states, self.commands, self.theta, self.disturbances, self.nominal_p)
+        return tuple(len(vector) for vector in vectors)
 
     def propagate(
         self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None, p: Array | None = None

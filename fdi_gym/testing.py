@@ -164,17 +164,26 @@ def _check_model(plant: Plant, scenario: FaultScenario) -> None:
 
 
 def _check_linear(plant: Plant) -> None:
-    """A plant that calls itself linear answers a sum of states, and of commands, with the sum of the answers."""
+    """A plant that calls itself linear adds up in x and in u, and answers to x alike under every u and theta."""
     rng = np.random.default_rng(0)
-    for moved, signals in (("x", plant.states), ("u", plant.commands)):
-        a, b = rng.standard_normal((2, len(signals))) * [s.scale for s in signals]
-        points = np.array([a + b, np.zeros_like(a), a, b])
-        rest = np.zeros((4, len(plant.commands if moved == "x" else plant.states)))
-        f = plant.propagate(0.0, points, rest) if moved == "x" else plant.propagate(0.0, rest, points)
-        error = np.abs(f[0] + f[1] - f[2] - f[3]).max()
-        assert error <= 1e-9 * max(1.0, np.abs(f).max()), (
-            f"the plant calls itself linear, but is not in {moved}: {error:.3g}"
-        )
+    x, more_x = rng.standard_normal((2, len(plant.states))) * [s.scale for s in plant.states]
+    u, more_u = rng.standard_normal((2, len(plant.commands))) * [s.scale for s in plant.commands]
+    healthy, theta = plant.nominal_theta, plant.nominal_theta + 0.5 * np.array([s.scale for s in plant.theta])
+
+    def of_x(x: Array, u: Array = 0.0 * u, theta: Array = healthy) -> Array:
+        return plant.propagate(0.0, x, u[None], theta[None]) - plant.propagate(0.0, 0.0 * x, u[None], theta[None])
+
+    def of_u(u: Array) -> Array:
+        return plant.propagate(0.0, 0.0 * x, u[None]) - plant.propagate(0.0, 0.0 * x, 0.0 * u[None])
+
+    errors = {
+        "x": of_x(x + more_x) - of_x(x) - of_x(more_x),
+        "u": of_u(u + more_u) - of_u(u) - of_u(more_u),
+        "x under other u and theta": of_x(x, u, theta) - of_x(x),
+    }
+    for what, error in errors.items():
+        worst = np.abs(error).max() / max(1.0, np.abs(of_x(x)).max(), np.abs(of_u(u)).max())
+        assert worst <= 1e-9, f"the plant calls itself linear, but is not in {what}: off by {worst:.3g}"
 
 
 def _with_short_episodes(plant: Plant, scenario: str, lengths: Sequence[int]) -> Plant:

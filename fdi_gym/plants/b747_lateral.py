@@ -82,7 +82,7 @@ Sign = Annotated[float, Meta(ge=-1.0, le=1.0)]
 Signs = Annotated[list[Sign], Meta(min_length=1)]
 Bank = Annotated[float, Meta(ge=-60.0, le=60.0)]  # deg
 Time = Annotated[float, Meta(ge=0.0, le=1e6)]  # s
-Factor = Annotated[float, Meta(ge=0.0, le=10.0)]
+Factor = Annotated[float, Meta(ge=-10.0, le=10.0)]
 Row4 = tuple[Factor, Factor, Factor, Factor]
 Row2 = tuple[Factor, Factor]
 
