@@ -1,0 +1,260 @@
+"""The Gaussian step in one compiled call: predict, update and their parts, for a batch of episodes and any plant.
+
+The model is the augmented one, X = [x; m; d]: the plant's state, magnitudes of its faults and disturbances that nothing
+measures. theta is nominal but for theta[entries], to which offset + direction m is added: an ordinary filter has the one
+line "offset 0, direction I", a bank one line for each of its models, and row i of a stack lies on line i % lines. f moves
+x by one sample (theta, d and the command held) and leaves m and d; h gives the chosen sensors. A Gaussian passes through
+f and h by one of three rules:
+
+    "extended"            A. H. Jazwinski, Stochastic Processes and Filtering Theory, 1970; Jacobians by differences
+    "unscented"           S. J. Julier, J. K. Uhlmann, Proceedings of the IEEE 92(3), 2004; lambda = 2, equal weights
+    "central difference"  M. Norgaard, N. K. Poulsen, O. Ravn, Automatica 36(11), 2000; interval sqrt(3)
+
+On a linear plant each is the Kalman filter. A sensor that did not report leaves no trace: the result is that of the
+filter without its row, whatever stands in y there. An episode's numbers do not depend on its neighbours, to the bit.
+
+Arrays are stacks with the episodes first. t (n,), u (n, n_u), d (n, n_D), y and seen (n, m) may have fewer rows, each of
+which then serves equally many consecutive episodes; Q and R may have fewer, which serve the episodes in turn (line by
+line). d is what is known of all the plant's disturbances, None where nothing is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fdi_gym.estimation import fused_kernels as kernels
+from fdi_gym.plant import Array, Plant, contiguous
+
+STEP = 1e-3  # of the central differences along the axes, in units of the entries' scales
+RULES = {
+    "extended": kernels.EXTENDED,
+    "unscented": kernels.UNSCENTED,
+    "central difference": kernels.CENTRAL_DIFFERENCE,
+}  # fmt: skip
+
+
+class Model(NamedTuple):
+    """A plant's augmented model with its constants packed for the kernels; made by `bind`."""
+
+    plant: Plant  # keeps its compiled equations alive
+    N: int
+    m: int
+    integers: Array
+    reals: Array
+    unmeasured: Array  # (1, n_D) zeros
+
+
+class Updated(NamedTuple):
+    """Outcome of an update. What was not seen has nu = 0 and the identity's row and column in S."""
+
+    X: Array  # (n, N)
+    P: Array  # (n, N, N)
+    nu: Array  # (n, m) innovation
+    S: Array  # (n, m, m) its covariance
+    nis: Array  # (n,) nu' S^-1 nu, chi-square with as many degrees of freedom as sensors were seen
+    log_likelihood: Array  # (n,) log density of what was seen, its 2 pi terms included; 0 where nothing was
+
+
+class Corrected(NamedTuple):
+    """Outcome of a correction: as `Updated`, with the gain."""
+
+    X: Array  # (n, N)
+    P: Array  # (n, N, N)
+    nu: Array  # (n, m)
+    S: Array  # (n, m, m)
+    nis: Array  # (n,)
+    log_likelihood: Array  # (n,)
+    K: Array  # (n, N, m), 0 for what was not seen
+
+
+def bind(
+    plant: Plant,
+    *,
+    scale: Sequence[float] | Array,
+    entries: Sequence[int] | Array,
+    disturbances: Sequence[int] | Array = (),
+    sensors: Sequence[int] | Array | None = None,
+    limit: Sequence[float] | Array | None = None,
+    lines: tuple[Array, Array] | None = None,
+    H: Array | None = None,
+) -> Model:
+    """The model of [x; m; d] of a plant.
+
+    Args:
+        plant: The plant.
+        scale: Typical size of each entry of X (N,); the differences along the axes take a thousandth of it.
+        entries: Positions (p,) in theta that the faults move.
+        disturbances: Positions (n_d,) in the plant's disturbances of those in X.
+        sensors: Positions (m,) in the plant's outputs of those that the filter hears. Default: all.
+        limit: Largest variance (N,) that a prediction leaves an entry; where it is passed the entry's row and column
+            shrink, so that correlations stay. Default: none.
+        lines: Offsets (lines, p) and directions (lines, p, n_m). Default: m is the deviation of theta[entries] itself.
+        H: (m, N) where the sensors are H X whatever u, t and d are: they are then not evaluated. Default: they are.
+
+    Raises:
+        ValueError: A position does not exist, or an array has the wrong shape or values that are no numbers.
+    """
+    n_x, n_theta, n_D = len(plant.states), len(plant.theta), len(plant.disturbances)
+    where = {
+        "entries": _positions("entries", entries, n_theta),
+        "disturbances": _positions("disturbances", disturbances, n_D),
+        "sensors": _positions("sensors", range(len(plant.outputs)) if sensors is None else sensors, len(plant.outputs)),
+    }
+    p, n_d, m = (len(a) for a in where.values())
+    offset, direction = (np.zeros((1, p)), np.eye(p)[None]) if lines is None else (np.array(a, float) for a in lines)
+    if offset.ndim != 2 or direction.ndim != 3 or direction.shape[:2] != offset.shape or offset.shape[1] != p:
+        raise ValueError(
+            f"lines are offsets (lines, {p}) and directions (lines, {p}, n_m); not {offset.shape}, {direction.shape}"
+        )
+    N = n_x + direction.shape[2] + n_d
+    size, widest = np.array(scale, float), np.full(N, np.inf) if limit is None else np.array(limit, float)
+    observed = np.zeros((0, N)) if H is None else np.array(H, float)
+    if size.shape != (N,) or not (np.isfinite(size) & (size > 0)).all():
+        raise ValueError(f"scale needs {N} positive numbers, not {scale}")
+    if widest.shape != (N,) or not (widest >= 0).all():
+        raise ValueError(f"limit needs {N} numbers that are not negative, not {limit}")
+    if H is not None and (observed.shape != (m, N) or not np.isfinite(observed).all()):
+        raise ValueError(f"H needs the shape ({m}, {N}) and finite numbers, not {observed.shape}")
+    dynamics, output, *_, project, _ = plant.addresses
+    sizes = (n_x, direction.shape[2], n_d, len(plant.commands), len(plant.outputs), n_theta, plant.nominal_p.size, n_D)
+    integers = [dynamics, output, project, plant.substeps, *sizes, p, m, len(offset), len(observed)]
+    reals = (plant.dt, plant.nominal_theta, plant.nominal_p, STEP * size, widest, offset, direction, observed)
+    return Model(
+        plant, N, m, np.concatenate([integers, *where.values()]).astype(np.int64),
+        np.concatenate([np.ravel(a) for a in reals]).astype(float), np.zeros((1, n_D)),
+    )  # fmt: skip
+
+
+def _positions(name: str, given: Any, count: int) -> Array:
+    positions = np.array(given, dtype=np.int64).reshape(-1)
+    if len(set(positions.tolist())) < len(positions) or not all(0 <= i < count for i in positions):
+        raise ValueError(f"{name} are different positions from 0 to {count - 1}, not {positions.tolist()}")
+    return positions
+
+
+def _rule(name: str) -> int:
+    if name not in RULES:
+        raise ValueError(f"unknown rule {name!r}; there are {', '.join(RULES)}")
+    return RULES[name]
+
+
+def _call(kernel: Any, *arguments: Any) -> None:
+    """Call a kernel. What it does not take as it lies (another type or order, read-only) it gets as a copy."""
+    try:
+        kernel(*arguments)
+    except TypeError:
+        kernel(*(_plain(a) if isinstance(a, np.ndarray) else a for a in arguments))
+
+
+def _plain(a: Array) -> Array:
+    return np.array(a, order="C") if a.dtype in (bool, np.int64) else contiguous(a)
+
+
+def f(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> Array:
+    """The points X (n, points, N) one sample after t (n,) [s], without noise: (n, points, N)."""
+    moved = np.empty(X.shape)
+    _call(kernels.images, True, model.integers, model.reals, X, t, u, model.unmeasured if d is None else d, moved)
+    return moved
+
+
+def h(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> Array:
+    """What the sensors read at the points X (n, points, N) at t (n,) [s], without noise: (n, points, m)."""
+    y = np.empty((*X.shape[:2], model.m))
+    _call(kernels.images, False, model.integers, model.reals, X, t, u, model.unmeasured if d is None else d, y)
+    return y
+
+
+def jacobian_f(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> tuple[Array, Array]:
+    """X (n, N) one sample after t (n,) [s], and the Jacobian of that (n, N, N) by central differences."""
+    n, N = X.shape
+    value, F = np.empty((n, N)), np.empty((n, N, N))
+    _call(kernels.jacobian, True, model.integers, model.reals, X, t, u, model.unmeasured if d is None else d, value, F)
+    return value, F
+
+
+def jacobian_h(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> tuple[Array, Array]:
+    """What the sensors read at X (n, N) at t (n,) [s]: (n, m), and its Jacobian (n, m, N) by central differences."""
+    n, N = X.shape
+    value, H = np.empty((n, model.m)), np.empty((n, model.m, N))
+    _call(kernels.jacobian, False, model.integers, model.reals, X, t, u, model.unmeasured if d is None else d, value, H)
+    return value, H
+
+
+def predict(
+    model: Model, rule: str, X: Array, P: Array, t: Array, u: Array, d: Array | None, Q: Array
+) -> tuple[Array, Array]:
+    """Mean (n, N) and covariance (n, N, N) one sample after t (n,) [s].
+
+    Args:
+        model: The model.
+        rule: One of `RULES`.
+        X: Mean (n, N) at t.
+        P: Its covariance (n, N, N). Where it has lost its definiteness, as little as helps is added to its diagonal.
+        t: Start of the interval (n,) [s].
+        u: Command (n, n_u) held over it.
+        d: Measured disturbance (n, n_D) held over it.
+        Q: Covariance (1, N, N) that a sample adds, or one for each line or episode.
+
+    Raises:
+        ValueError: Unknown rule, or shapes that do not fit.
+    """
+    X1, P1 = np.empty(X.shape), np.empty(P.shape)
+    known = model.unmeasured if d is None else d
+    _call(kernels.predict, _rule(rule), model.integers, model.reals, X, P, t, u, known, Q, X1, P1)
+    return X1, P1
+
+
+def update(
+    model: Model, rule: str, X: Array, P: Array, t: Array, u: Array, d: Array | None, y: Array, seen: Array, R: Array
+) -> Updated:
+    """Update with the sensors at t.
+
+    Args:
+        model: The model.
+        rule: One of `RULES`; without effect where the model has H.
+        X: Predicted mean (n, N).
+        P: Its covariance (n, N, N).
+        t: Time of the sample (n,) [s].
+        u: Command (n, n_u) held up to it.
+        d: Measured disturbance (n, n_D).
+        y: What the sensors read (n, m).
+        seen: Which of them reported (n, m), bool.
+        R: Covariance of their noise (1, m, m), or one for each line or episode.
+
+    Raises:
+        ValueError: Unknown rule, or shapes that do not fit.
+    """
+    n, m = len(X), model.m
+    X1, P1, nu, S = np.empty(X.shape), np.empty(P.shape), np.empty((n, m)), np.empty((n, m, m))
+    nis, log = np.empty(n), np.empty(n)
+    known = model.unmeasured if d is None else d
+    _call(
+        kernels.update, _rule(rule), model.integers, model.reals, X, P, t, u, known, y, seen, R,
+        X1, P1, nu, S, nis, log,
+    )  # fmt: skip
+    return Updated(X1, P1, nu, S, nis, log)
+
+
+def correct(X: Array, P: Array, mean: Array, cross: Array, S: Array, y: Array, seen: Array) -> Corrected:
+    """The Kalman correction alone, for a method that brings its own moments.
+
+    Args:
+        X: Predicted mean (n, N).
+        P: Its covariance (n, N, N).
+        mean: Mean of what the sensors read (n, m).
+        cross: Covariance of X with it (n, N, m).
+        S: Its own covariance, noise included (n, m, m).
+        y: What they read (n, m).
+        seen: Which of them reported (n, m), bool.
+
+    Raises:
+        ValueError: Shapes that do not fit.
+    """
+    n, m = mean.shape
+    X1, P1, K = np.empty(X.shape), np.empty(P.shape), np.empty((n, X.shape[1], m))
+    nu, S1, nis, log = np.empty((n, m)), np.empty((n, m, m)), np.empty(n), np.empty(n)
+    _call(kernels.correct, X, P, y, seen, mean, cross, S, X1, P1, nu, S1, K, nis, log)
+    return Corrected(X1, P1, nu, S1, nis, log, K)
