@@ -40,10 +40,12 @@ class Model(NamedTuple):
     """A plant's augmented model with its constants packed for the kernels; made by `bind`."""
 
     plant: Plant  # keeps its compiled equations alive
-    N: int
-    m: int
-    integers: Array
-    reals: Array
+    m: int  # sensors
+    constants: tuple[Array, Array, Array, Array, Array]  # what tells f and h, in the kernels' order
+    step: Array  # (N,) of the differences along the axes
+    limit: Array  # (N,)
+    linear: Array  # (n_x, ...), or (0, 0) where the plant is not linear
+    H: Array  # (m, N), or (0, N) where the sensors are not
     unmeasured: Array  # (1, n_D) zeros
 
 
@@ -119,13 +121,12 @@ def bind(
     if H is not None and (observed.shape != (m, N) or not np.isfinite(observed).all()):
         raise ValueError(f"H needs the shape ({m}, {N}) and finite numbers, not {observed.shape}")
     dynamics, output, *_, project, _ = plant.addresses
-    sizes = (n_x, direction.shape[2], n_d, len(plant.commands), len(plant.outputs), n_theta, plant.nominal_p.size, n_D)
-    integers = [dynamics, output, project, plant.substeps, *sizes, p, m, len(offset), len(observed)]
-    reals = (plant.dt, plant.nominal_theta, plant.nominal_p, STEP * size, widest, offset, direction, observed)
-    return Model(
-        plant, N, m, np.concatenate([integers, *where.values()]).astype(np.int64),
-        np.concatenate([np.ravel(a) for a in reals]).astype(float), np.zeros((1, n_D)),
-    )  # fmt: skip
+    sizes = (plant.substeps, n_x, len(plant.outputs), n_theta, n_D, p, n_d, m, len(plant.commands))
+    integers = np.concatenate([[dynamics, output, project, *sizes], *where.values()]).astype(np.int64)
+    reals = np.concatenate([[plant.dt], plant.nominal_theta, plant.nominal_p])
+    constants = (integers, reals, STEP * size, contiguous(offset), contiguous(direction))
+    linear = _linear(plant, where["entries"])
+    return Model(plant, m, constants, STEP * size, widest, linear, contiguous(observed), np.zeros((1, n_D)))
 
 
 def _positions(name: str, given: Any, count: int) -> Array:
@@ -133,6 +134,38 @@ def _positions(name: str, given: Any, count: int) -> Array:
     if len(set(positions.tolist())) < len(positions) or not all(0 <= i < count for i in positions):
         raise ValueError(f"{name} are different positions from 0 to {count - 1}, not {positions.tolist()}")
     return positions
+
+
+def _linear(plant: Plant, entries: Array) -> Array:
+    """[g, A, B, G, E[0], E[1], ...] of x+ = g + A x + B u + G d + (E[0] + sum u_k E[1 + k]) dtheta; (0, 0) if not so.
+
+    Read off by unit steps, and compared with the plant at random points, since a declaration may be wrong.
+    """
+    if not plant.linear:
+        return np.zeros((0, 0))
+    n_x, n_u, n_D, p = len(plant.states), len(plant.commands), len(plant.disturbances), len(entries)
+    x, u, d = np.zeros((1, n_x)), np.zeros((1, n_u)), np.zeros((1, n_D))
+    theta = np.tile(plant.nominal_theta, (p, 1))
+    theta[np.arange(p), entries] += 1.0
+    g = plant.propagate(0.0, x, u, None, d)[0]
+    A = (plant.propagate(0.0, np.eye(n_x), u, None, d) - g).T
+    B = (plant.propagate(0.0, np.zeros((n_u, n_x)), np.eye(n_u), None, d) - g).T
+    G = (plant.propagate(0.0, np.zeros((n_D, n_x)), u, None, np.eye(n_D)) - g).T
+    commands = np.concatenate([u, np.eye(n_u)])
+    E = np.stack([(plant.propagate(0.0, np.zeros((p, n_x)), c[None], theta, d) - g - B @ c).T for c in commands])
+    E[1:] -= E[0]
+
+    rng = np.random.default_rng(0)
+    x, u, d, z = (rng.standard_normal((16, n)) for n in (n_x, n_u, n_D, p))
+    x *= [s.scale for s in plant.states]
+    theta = np.tile(plant.nominal_theta, (16, 1))
+    theta[:, entries] += z
+    gain = E[0] + np.einsum("nk,kap->nap", u, E[1:])
+    expected = g + x @ A.T + u @ B.T + np.einsum("nap,np->na", gain, z) + d @ G.T
+    found = plant.propagate(rng.uniform(0, 100, 16), x, u, theta, d)
+    if not np.allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(found).max()):
+        return np.zeros((0, 0))
+    return contiguous(np.concatenate([g[:, None], A, B, G, *E], axis=1))
 
 
 def _rule(name: str) -> int:
@@ -156,31 +189,39 @@ def _plain(a: Array) -> Array:
 def f(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> Array:
     """The points X (n, points, N) one sample after t (n,) [s], without noise: (n, points, N)."""
     moved = np.empty(X.shape)
-    _call(kernels.images, True, model.integers, model.reals, X, t, u, model.unmeasured if d is None else d, moved)
+    _call(kernels.images, True, *model.constants, X, t, u, model.unmeasured if d is None else d, moved)
     return moved
 
 
 def h(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> Array:
     """What the sensors read at the points X (n, points, N) at t (n,) [s], without noise: (n, points, m)."""
     y = np.empty((*X.shape[:2], model.m))
-    _call(kernels.images, False, model.integers, model.reals, X, t, u, model.unmeasured if d is None else d, y)
+    _call(kernels.images, False, *model.constants, X, t, u, model.unmeasured if d is None else d, y)
     return y
 
 
 def jacobian_f(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> tuple[Array, Array]:
     """X (n, N) one sample after t (n,) [s], and the Jacobian of that (n, N, N) by central differences."""
-    n, N = X.shape
-    value, F = np.empty((n, N)), np.empty((n, N, N))
-    _call(kernels.jacobian, True, model.integers, model.reals, X, t, u, model.unmeasured if d is None else d, value, F)
-    return value, F
+    return _differences(model, f(model, _along_axes(model, X), t, u, d))
 
 
 def jacobian_h(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> tuple[Array, Array]:
     """What the sensors read at X (n, N) at t (n,) [s]: (n, m), and its Jacobian (n, m, N) by central differences."""
-    n, N = X.shape
-    value, H = np.empty((n, model.m)), np.empty((n, model.m, N))
-    _call(kernels.jacobian, False, model.integers, model.reals, X, t, u, model.unmeasured if d is None else d, value, H)
-    return value, H
+    return _differences(model, h(model, _along_axes(model, X), t, u, d))
+
+
+def _along_axes(model: Model, X: Array) -> Array:
+    """X (n, N), and X plus and minus the step of each entry: (n, 2 N + 1, N)."""
+    if X.ndim != 2 or X.shape[1] != len(model.step):
+        raise ValueError(f"X needs the shape (n, {len(model.step)}), not {X.shape}")
+    step = np.diag(model.step)
+    return X[:, None] + np.concatenate([np.zeros_like(step[:1]), step, -step])
+
+
+def _differences(model: Model, values: Array) -> tuple[Array, Array]:
+    N = len(model.step)
+    columns = (values[:, 1 : N + 1] - values[:, N + 1 :]) / (2 * model.step[:, None])
+    return values[:, 0], np.ascontiguousarray(np.swapaxes(columns, 1, 2))
 
 
 def predict(
@@ -203,7 +244,7 @@ def predict(
     """
     X1, P1 = np.empty(X.shape), np.empty(P.shape)
     known = model.unmeasured if d is None else d
-    _call(kernels.predict, _rule(rule), model.integers, model.reals, X, P, t, u, known, Q, X1, P1)
+    _call(kernels.predict, _rule(rule), *model.constants, model.limit, model.linear, X, P, t, u, known, Q, X1, P1)
     return X1, P1
 
 
@@ -232,7 +273,7 @@ def update(
     nis, log = np.empty(n), np.empty(n)
     known = model.unmeasured if d is None else d
     _call(
-        kernels.update, _rule(rule), model.integers, model.reals, X, P, t, u, known, y, seen, R,
+        kernels.update, _rule(rule), *model.constants, model.H, X, P, t, u, known, y, seen, R,
         X1, P1, nu, S, nis, log,
     )  # fmt: skip
     return Updated(X1, P1, nu, S, nis, log)

@@ -17,8 +17,6 @@ in an order that no batch changes. Matrices are kept transposed (`first`, `cross
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numba
 import numpy as np
 from numba import boolean, float64, int64, void
@@ -28,123 +26,53 @@ from fdi_gym.kernels import M, V, _advance, _project_at, compiled, map_at
 EXTENDED, UNSCENTED, CENTRAL_DIFFERENCE = 0, 1, 2
 LOG_2PI = float(np.log(2.0 * np.pi))
 JITTER, RETRIES = 1e-14, 7  # added to the diagonal where the factorisation fails, times 100 at each retry
+SIZES = 12  # integers before the lists of positions
 
 I1, B2, M3 = int64[::1], boolean[:, ::1], float64[:, :, ::1]
-SIZES = 16  # integers before the lists
+# integers, reals, step, offset, direction: the constants of a model that tell its f and h, as `fused.bind` packs them
+MODEL = (I1, V, V, M, M3)
 
-Array = np.ndarray
 _helper = numba.njit(error_model="numpy")
 
 
-class Layout(NamedTuple):
-    """The constants of a model as the kernels see them; `fused.bind` packs them."""
-
-    dynamics_at: int
-    output_at: int
-    project_at: int
-    substeps: int
-    n_x: int
-    n_z: int
-    n_d: int
-    n_u: int
-    n_y: int
-    entries: Array  # (p,) of theta
-    disturbances: Array  # (n_d,) of the plant's
-    sensors: Array  # (m,) of the plant's
-    dt: float
-    nominal: Array  # (n_theta,)
-    physical: Array  # (n_p,)
-    step: Array  # (N,) of the differences along the axes
-    limit: Array  # (N,)
-    offset: Array  # (lines, p)
-    direction: Array  # (lines, p, n_z)
-    H: Array  # (m, N), or without rows where the sensors are not linear
-    n_D: int  # all disturbances of the plant
-
-
-class Work(NamedTuple):
-    """What an episode needs on the way; every entry is written before it is read."""
-
-    x: Array
-    theta: Array
-    still: Array  # zeros: theta does not move within the sample
-    theta_now: Array
-    d: Array
-    k1: Array
-    k2: Array
-    k3: Array
-    k4: Array
-    z: Array
-    y: Array  # (n_y,)
-    point: Array  # (N,)
-    plus: Array  # (m,): images
-    minus: Array
-    centre: Array
-    mean: Array
-    U: Array  # (N, N) the upper factor of P
-    first: Array  # (N, m)
-    second: Array
-    cross: Array  # (m, N)
-    cov: Array  # (m, m)
-
-
 @_helper
-def _layout(integers, reals):
-    n_x, n_z, n_d, n_theta, n_p = integers[4], integers[5], integers[6], integers[9], integers[10]
-    p, m, lines, rows, N = integers[12], integers[13], integers[14], integers[15], n_x + n_z + n_d
-    i1 = SIZES + p
-    i2 = i1 + n_d
-    r1 = 1 + n_theta
-    r2 = r1 + n_p
-    r3 = r2 + N
-    r4 = r3 + N
-    r5 = r4 + lines * p
-    r6 = r5 + lines * p * n_z
-    return Layout(
-        integers[0], integers[1], integers[2], integers[3], n_x, n_z, n_d, integers[7], integers[8],
-        integers[SIZES:i1], integers[i1:i2], integers[i2 : i2 + m],
-        reals[0], reals[1:r1], reals[r1:r2], reals[r2:r3], reals[r3:r4], reals[r4:r5].reshape((lines, p)),
-        reals[r5:r6].reshape((lines, p, n_z)), reals[r6 : r6 + rows * N].reshape((rows, N)), integers[11],
-    )  # fmt: skip
+def _images(moving, integers, reals, offset, direction, t, points, u, known, values):
+    """f (moving) or h of points (M, N) of an episode on the line (offset (p,), direction (p, n_m)).
 
-
-@_helper
-def _work(c, m):
-    n, N, n_theta = c.n_x, c.step.size, c.nominal.size
-    return Work(
-        np.empty(n), np.empty(n_theta), np.zeros(n_theta), np.empty(n_theta), np.empty(c.n_D), np.empty(n), np.empty(n),
-        np.empty(n), np.empty(n), np.empty(n), np.empty(c.n_y), np.empty(N), np.empty(m), np.empty(m), np.empty(m),
-        np.empty(m), np.empty((N, N)), np.empty((N, m)), np.empty((N, m)), np.empty((m, N)), np.empty((m, m)),
-    )  # fmt: skip
-
-
-@_helper
-def _image(c, moving, line, t, X, u, known, w, out):
-    """f (moving) or h of one point X (N,): the state one sample later (n_x,), or what the chosen sensors read (m,)."""
-    for j in range(c.nominal.size):
-        w.theta[j] = c.nominal[j]
-    for e in range(c.entries.size):
-        deviation = c.offset[line, e]
-        for j in range(c.n_z):
-            deviation += c.direction[line, e, j] * X[c.n_x + j]
-        w.theta[c.entries[e]] += deviation
-    for j in range(known.size):
-        w.d[j] = known[j]
-    for j in range(c.n_d):
-        w.d[c.disturbances[j]] = X[c.n_x + c.n_z + j]
-    for j in range(c.n_x):
-        w.x[j] = X[j]
-    if moving:
-        _advance(
-            map_at(c.dynamics_at), _project_at(c.project_at), t, c.dt, c.substeps, w.x, u, w.theta, w.still, w.still,
-            w.d, c.physical, w.theta_now, w.k1, w.k2, w.k3, w.k4, w.z,
-        )  # fmt: skip
-        for j in range(c.n_x):
-            out[j] = w.x[j]
-    else:
-        map_at(c.output_at)(t, w.x, u, w.theta, w.d, c.physical, w.y)
-        for j in range(c.sensors.size):
-            out[j] = w.y[c.sensors[j]]
+    That is the state one sample later, or what the chosen sensors read.
+    """
+    dynamics, output, project = map_at(integers[0]), map_at(integers[1]), _project_at(integers[2])
+    substeps, n_x, n_y, n_theta = integers[3], integers[4], integers[5], integers[6]
+    p, n_d, m = integers[8], integers[9], integers[10]
+    n_m = direction.shape[1]
+    entries, rest = integers[SIZES : SIZES + p], integers[SIZES + p :]
+    disturbances, sensors = rest[:n_d], rest[n_d:]
+    dt, nominal, physical = reals[0], reals[1 : 1 + n_theta], reals[1 + n_theta :]
+    x, y, theta, theta_now, still = np.empty(n_x), np.empty(n_y), np.empty(n_theta), np.empty(n_theta), np.zeros(n_theta)
+    d = known.copy()
+    k1, k2, k3, k4, z = np.empty(n_x), np.empty(n_x), np.empty(n_x), np.empty(n_x), np.empty(n_x)
+    for i in range(points.shape[0]):
+        for j in range(n_theta):
+            theta[j] = nominal[j]
+        for e in range(p):
+            deviation = offset[e]
+            for j in range(n_m):
+                deviation += direction[e, j] * points[i, n_x + j]
+            theta[entries[e]] += deviation
+        for j in range(n_d):
+            d[disturbances[j]] = points[i, n_x + n_m + j]
+        for j in range(n_x):
+            x[j] = points[i, j]
+        if moving:
+            _advance(
+                dynamics, project, t, dt, substeps, x, u, theta, still, still, d, physical, theta_now, k1, k2, k3, k4, z
+            )
+            for j in range(n_x):
+                values[i, j] = x[j]
+        else:
+            output(t, x, u, theta, d, physical, y)
+            for j in range(m):
+                values[i, j] = y[sensors[j]]
 
 
 @_helper
@@ -178,103 +106,140 @@ def _factor(P, U):
 
 
 @_helper
-def _differences(c, moving, line, t, X, u, known, w):
-    """The image of X (w.centre) and the Jacobian's columns (rows of w.first), by central differences along the axes."""
-    N, m = X.size, w.centre.size
-    _image(c, moving, line, t, X, u, known, w, w.centre)
-    for i in range(N):
-        w.point[i] = X[i]
-    for j in range(N):
-        w.point[j] = X[j] + c.step[j]
-        _image(c, moving, line, t, w.point, u, known, w, w.plus)
-        w.point[j] = X[j] - c.step[j]
-        _image(c, moving, line, t, w.point, u, known, w, w.minus)
-        w.point[j] = X[j]
-        for a in range(m):
-            w.first[j, a] = (w.plus[a] - w.minus[a]) / (2.0 * c.step[j])
-
-
-@_helper
-def _through(c, rule, moving, line, t, X, P, u, known, w):
-    """N(X, P) through f (moving) or h: w.mean (m,), w.cov (m, m) and w.cross (m, N) with what went in."""
-    N, m = X.size, w.centre.size
-    for a in range(m):
-        for i in range(N):
-            w.cross[a, i] = 0.0
-        for b in range(m):
-            w.cov[a, b] = 0.0
+def _through(rule, moving, integers, reals, step, offset, direction, t, X, P, u, known, mean, cross, cov):
+    """N(X, P) through f (moving) or h: mean (m,), cov (m, m) and cross (m, N) with what went in."""
+    N, m, low = X.size, mean.size, 0
+    points, values, first = np.empty((2 * N + 1, N)), np.empty((2 * N + 1, m)), np.empty((N, m))
+    h2 = N + 2.0 if rule == UNSCENTED else 3.0
+    h = np.sqrt(h2)
     if rule == EXTENDED:
-        _differences(c, moving, line, t, X, u, known, w)
+        U = np.zeros((N, N))
+        for j in range(N):
+            U[j, j] = step[j]
+        h = 1.0
+    else:
+        U = np.empty((N, N))
+        _factor(P, U)
+        low = integers[4] if moving else 0  # of f, nobody asks for the covariance with x before
+    for i in range(N):
+        points[0, i] = X[i]
+    for j in range(N):
+        for i in range(N):
+            offset_i = h * U[j, i] if i >= j else 0.0
+            points[1 + j, i] = X[i] + offset_i
+            points[1 + N + j, i] = X[i] - offset_i
+    _images(moving, integers, reals, offset, direction, t, points, u, known, values)
+    for a in range(m):
+        mean[a] = 0.0
+        for i in range(N):
+            cross[a, i] = 0.0
+        for b in range(m):
+            cov[a, b] = 0.0
+    for j in range(N):
+        half = 0.5 / step[j] if rule == EXTENDED else 0.5 / h
         for a in range(m):
-            w.mean[a] = w.centre[a]
+            first[j, a] = (values[1 + j, a] - values[1 + N + j, a]) * half
+    if rule == EXTENDED:
+        for a in range(m):
             for j in range(N):
                 for i in range(N):
-                    w.cross[a, i] += w.first[j, a] * P[j, i]
+                    cross[a, i] += first[j, a] * P[j, i]
             for i in range(N):
                 for b in range(a + 1):
-                    w.cov[a, b] += w.cross[a, i] * w.first[i, b]
+                    cov[a, b] += cross[a, i] * first[i, b]
     else:
-        h2 = N + 2.0 if rule == UNSCENTED else 3.0
-        h = np.sqrt(h2)
-        weight = 1.0 / (4.0 * h2) if rule == UNSCENTED else (h2 - 1.0) / (4.0 * h2 * h2)
-        _factor(P, w.U)
-        _image(c, moving, line, t, X, u, known, w, w.centre)
-        for a in range(m):
-            w.mean[a] = 0.0
+        second = values[1 : N + 1]
         for j in range(N):
-            w.point[j] = X[j]
-        for j in range(N):
-            for i in range(j, N):
-                w.point[i] = X[i] + h * w.U[j, i]
-            _image(c, moving, line, t, w.point, u, known, w, w.plus)
-            for i in range(j, N):
-                w.point[i] = X[i] - h * w.U[j, i]
-            _image(c, moving, line, t, w.point, u, known, w, w.minus)
-            w.point[j] = X[j]
             for a in range(m):
-                w.first[j, a] = (w.plus[a] - w.minus[a]) / (2.0 * h)
-                w.second[j, a] = w.plus[a] + w.minus[a] - 2.0 * w.centre[a]
-                w.mean[a] += w.second[j, a]
+                second[j, a] = values[1 + j, a] + values[1 + N + j, a] - 2.0 * values[0, a]
+                mean[a] += second[j, a]
+        weight = 1.0 / (4.0 * h2) if rule == UNSCENTED else (h2 - 1.0) / (4.0 * h2 * h2)
         for a in range(m):
-            w.mean[a] /= 2.0 * h2
+            mean[a] /= 2.0 * h2
             for j in range(N):
-                for i in range(j, N):
-                    w.cross[a, i] += w.first[j, a] * w.U[j, i]
-                scaled = weight * w.second[j, a]
+                for i in range(max(j, low), N):
+                    cross[a, i] += first[j, a] * U[j, i]
+                weighed = weight * second[j, a]
                 for b in range(a + 1):
-                    w.cov[a, b] += w.first[j, a] * w.first[j, b] + scaled * w.second[j, b]
+                    cov[a, b] += first[j, a] * first[j, b] + weighed * second[j, b]
             if rule == UNSCENTED:
                 for b in range(a + 1):
-                    w.cov[a, b] -= w.mean[a] * w.mean[b]
-        for a in range(m):
-            w.mean[a] += w.centre[a]
+                    cov[a, b] -= mean[a] * mean[b]
     for a in range(m):
+        mean[a] += values[0, a]
         for b in range(a):
-            w.cov[b, a] = w.cov[a, b]
+            cov[b, a] = cov[a, b]
 
 
 @_helper
-def _check(c, n, N, t, u, known):
-    if N != c.step.size:
+def _through_linear(F, P, cross, cov):
+    """cross = F P and cov = F P F' for F (m, N)."""
+    m, N = F.shape
+    for a in range(m):
+        for i in range(N):
+            cross[a, i] = 0.0
+        for j in range(N):
+            for i in range(N):
+                cross[a, i] += F[a, j] * P[j, i]
+        for b in range(a + 1):
+            cov[a, b] = 0.0
+            for j in range(N):
+                cov[a, b] += cross[a, j] * F[b, j]
+            cov[b, a] = cov[a, b]
+
+
+@_helper
+def _linear(integers, offset, direction, plant, X, u, known, F, mean):
+    """mean = f(X) and F (n_x, N) its Jacobian, for a plant x+ = g + A x + B u + G d + (E[0] + sum u_k E[1 + k]) dtheta.
+
+    plant (n_x, ...) has the columns [g, A, B, G, E[0], E[1], ...].
+    """
+    n_x, n_u, n_D, p, n_d, n_m = F.shape[0], u.size, known.size, offset.size, integers[9], direction.shape[1]
+    B = 1 + n_x
+    G = B + n_u
+    E = G + n_D
+    for a in range(n_x):
+        mean[a] = plant[a, 0]
+        for k in range(n_u):
+            mean[a] += plant[a, B + k] * u[k]
+        for j in range(n_D):
+            mean[a] += plant[a, G + j] * known[j]
+        for j in range(n_x):
+            F[a, j] = plant[a, 1 + j]
+        for j in range(n_m):
+            F[a, n_x + j] = 0.0
+        for e in range(p):
+            gain = plant[a, E + e]
+            for k in range(n_u):
+                gain += u[k] * plant[a, E + (1 + k) * p + e]
+            mean[a] += gain * offset[e]
+            for j in range(n_m):
+                F[a, n_x + j] += gain * direction[e, j]
+        for j in range(n_d):
+            i = integers[SIZES + p + j]
+            F[a, n_x + n_m + j] = plant[a, G + i]
+            mean[a] -= plant[a, G + i] * known[i]  # X has it
+        for j in range(F.shape[1]):
+            mean[a] += F[a, j] * X[j]
+
+
+@_helper
+def _check(integers, step, X, t, u, known):
+    n = X.shape[0]
+    if X.shape[1] != step.size:
         raise ValueError("X needs one entry for each of the model's [x; m; d]")
     if t.size == 0 or n % t.size or u.shape[0] == 0 or n % u.shape[0] or known.shape[0] == 0 or n % known.shape[0]:
         raise ValueError("t, u and d need one row for each episode, or fewer that serve equally many episodes each")
-    if u.shape[1] != c.n_u:
-        raise ValueError("u needs one entry for each command of the plant")
-    if known.shape[1] != c.n_D:
-        raise ValueError("d needs one entry for each disturbance of the plant, measured or not")
+    if u.shape[1] != integers[SIZES - 1] or known.shape[1] != integers[7]:
+        raise ValueError("u needs one entry for each command of the plant, d one for each disturbance, measured or not")
 
 
 @_helper
-def _check_stack(M, n, N):
-    if M.shape[0] == 0 or n % M.shape[0] or M.shape[1] != N or M.shape[2] != N:
-        raise ValueError("Q needs the shape (1, N, N) and R (1, m, m), or more that serve the episodes in turn")
-
-
-@_helper
-def _check_covariance(P, n, N):
+def _check_covariances(n, P, N, noise, m):
     if P.shape != (n, N, N):
         raise ValueError("P needs the shape (n, N, N) for X (n, N)")
+    if noise.shape[0] == 0 or n % noise.shape[0] or noise.shape[1] != m or noise.shape[2] != m:
+        raise ValueError("Q needs the shape (1, N, N) and R (1, m, m), or more that serve the episodes in turn")
 
 
 @_helper
@@ -283,36 +248,41 @@ def _check_sensors(n, m, y, seen):
         raise ValueError("y and seen need a row for each episode, or for equally many, and one entry for each sensor")
 
 
-@compiled(void(int64, I1, V, M, M3, V, M, M, M3, M, M3))
-def predict(rule, integers, reals, X, P, t, u, known, Q, X1, P1):
+@compiled(void(int64, *MODEL, V, M, M, M3, V, M, M, M3, M, M3))
+def predict(rule, integers, reals, step, offset, direction, limit, plant, X, P, t, u, known, Q, X1, P1):
     """X1 and P1 one sample after X (n, N) and P (n, N, N)."""
-    c = _layout(integers, reals)
-    n, N, n_x = X.shape[0], c.step.size, c.n_x
+    (n, N), n_x = X.shape, integers[4]
     if n == 0:
         return
-    _check(c, n, X.shape[1], t, u, known)
-    _check_covariance(P, n, N)
-    _check_stack(Q, n, N)
-    w = _work(c, n_x)
-    every_t, every_u, every_d = n // t.size, n // u.shape[0], n // known.shape[0]
+    _check(integers, step, X, t, u, known)
+    _check_covariances(n, P, N, Q, N)
+    mean, cross, cov, F = np.empty(n_x), np.empty((n_x, N)), np.empty((n_x, n_x)), np.empty((n_x, N))
     for e in range(n):
-        line = e % c.offset.shape[0]
-        _through(c, rule, True, line, t[e // every_t], X[e], P[e], u[e // every_u], known[e // every_d], w)
+        line = e % offset.shape[0]
+        ue, de = u[e * u.shape[0] // n], known[e * known.shape[0] // n]
+        if plant.shape[0] > 0:
+            _linear(integers, offset[line], direction[line], plant, X[e], ue, de, F, mean)
+            _through_linear(F, P[e], cross, cov)
+        else:
+            te = t[e * t.size // n]
+            _through(
+                rule, True, integers, reals, step, offset[line], direction[line], te, X[e], P[e], ue, de, mean, cross, cov
+            )
         Qe = Q[e % Q.shape[0]]
-        for i in range(n_x):
-            X1[e, i] = w.mean[i]
-            for j in range(n_x):
-                P1[e, i, j] = w.cov[i, j] + Qe[i, j]
-            for j in range(n_x, N):
-                P1[e, i, j] = w.cross[i, j] + Qe[i, j]
-                P1[e, j, i] = w.cross[i, j] + Qe[j, i]
-        for i in range(n_x, N):
-            X1[e, i] = X[e, i]
-            for j in range(n_x, N):
-                P1[e, i, j] = 0.5 * (P[e, i, j] + P[e, j, i]) + Qe[i, j]
         for i in range(N):
-            if P1[e, i, i] > c.limit[i]:
-                shrink = np.sqrt(c.limit[i] / P1[e, i, i])
+            X1[e, i] = mean[i] if i < n_x else X[e, i]
+            for j in range(i + 1):
+                if i < n_x:
+                    moved = cov[i, j]
+                elif j < n_x:
+                    moved = cross[j, i]
+                else:
+                    moved = 0.5 * (P[e, i, j] + P[e, j, i])
+                P1[e, i, j] = moved + Qe[i, j]
+                P1[e, j, i] = moved + Qe[j, i]
+        for i in range(N):
+            if P1[e, i, i] > limit[i]:
+                shrink = np.sqrt(limit[i] / P1[e, i, i])
                 for j in range(N):
                     P1[e, i, j] *= shrink
                     P1[e, j, i] *= shrink
@@ -360,49 +330,37 @@ def _correct(X, P, y, seen, mean, S, cross, U, white, X1, P1, nu, S1):
     return distance, log - 0.5 * distance
 
 
-@compiled(void(int64, I1, V, M, M3, V, M, M, M, B2, M3, M, M3, M, M3, V, V))
-def update(rule, integers, reals, X, P, t, u, known, y, seen, R, X1, P1, nu, S, distance, log):
-    """X1 and P1 after the sensors y (rows, m) at t, of which `seen` reported."""
-    c = _layout(integers, reals)
-    n, N, m = X.shape[0], c.step.size, c.sensors.size
+@compiled(void(int64, *MODEL, M, M, M3, V, M, M, M, B2, M3, M, M3, M, M3, V, V))
+def update(rule, integers, reals, step, offset, direction, H, X, P, t, u, known, y, seen, R, X1, P1, nu, S, distance, log):
+    """X1 and P1 after the sensors y (n, m) at t, of which `seen` reported."""
+    (n, N), m = X.shape, integers[10]
     if n == 0:
         return
-    _check(c, n, X.shape[1], t, u, known)
-    _check_covariance(P, n, N)
-    _check_stack(R, n, m)
+    _check(integers, step, X, t, u, known)
+    _check_covariances(n, P, N, R, m)
     _check_sensors(n, m, y, seen)
-    w = _work(c, m)
-    U, white = np.empty((m, m)), np.empty(m)
-    every_t, every_u, every_d, every_y = n // t.size, n // u.shape[0], n // known.shape[0], n // y.shape[0]
+    mean, cross, cov, U, white = np.zeros(m), np.zeros((m, N)), np.zeros((m, m)), np.empty((m, m)), np.empty(m)
     for e in range(n):
-        ye, reported = y[e // every_y], seen[e // every_y]
+        ye, reported = y[e * y.shape[0] // n], seen[e * y.shape[0] // n]
         if not reported.any():
+            pass  # and nothing of what the episode before has left enters
+        elif H.shape[0] > 0:
             for a in range(m):
-                w.mean[a] = 0.0
-                for b in range(m):
-                    w.cov[a, b] = 0.0
-        elif c.H.shape[0] > 0:
-            for a in range(m):
-                w.mean[a] = 0.0
-                for i in range(N):
-                    w.cross[a, i] = 0.0
+                mean[a] = 0.0
                 for j in range(N):
-                    w.mean[a] += c.H[a, j] * X[e, j]
-                    for i in range(N):
-                        w.cross[a, i] += c.H[a, j] * P[e, j, i]
-                for b in range(a + 1):
-                    w.cov[a, b] = 0.0
-                    for j in range(N):
-                        w.cov[a, b] += w.cross[a, j] * c.H[b, j]
-                    w.cov[b, a] = w.cov[a, b]
+                    mean[a] += H[a, j] * X[e, j]
+            _through_linear(H, P[e], cross, cov)
         else:
-            line = e % c.offset.shape[0]
-            _through(c, rule, False, line, t[e // every_t], X[e], P[e], u[e // every_u], known[e // every_d], w)
+            line = e % offset.shape[0]
+            te, ue, de = t[e * t.size // n], u[e * u.shape[0] // n], known[e * known.shape[0] // n]
+            _through(
+                rule, False, integers, reals, step, offset[line], direction[line], te, X[e], P[e], ue, de, mean, cross, cov
+            )
         Re = R[e % R.shape[0]]
         for a in range(m):
             for b in range(m):
-                w.cov[a, b] += Re[a, b]
-        distance[e], log[e] = _correct(X[e], P[e], ye, reported, w.mean, w.cov, w.cross, U, white, X1[e], P1[e], nu[e], S[e])
+                cov[a, b] += Re[a, b]
+        distance[e], log[e] = _correct(X[e], P[e], ye, reported, mean, cov, cross, U, white, X1[e], P1[e], nu[e], S[e])
 
 
 @compiled(void(M, M3, M, B2, M, M3, M3, M, M3, M, M3, M3, V, V))
@@ -411,17 +369,15 @@ def correct(X, P, y, seen, mean, cross, S, X1, P1, nu, S1, K, distance, log):
     (n, N), m = X.shape, mean.shape[1]
     if n == 0:
         return
-    _check_covariance(P, n, N)
+    if mean.shape[0] != n or cross.shape != (n, N, m) or S.shape != (n, m, m) or P.shape != (n, N, N):
+        raise ValueError("the shapes are X (n, N), P (n, N, N), mean (n, m), cross (n, N, m) and S (n, m, m)")
     _check_sensors(n, m, y, seen)
-    if mean.shape[0] != n or cross.shape != (n, N, m) or S.shape != (n, m, m):
-        raise ValueError("the moments need the shapes mean (n, m), cross (n, N, m) and S (n, m, m)")
     W, U, white = np.empty((m, N)), np.empty((m, m)), np.empty(m)
-    every_y = n // y.shape[0]
     for e in range(n):
         for a in range(m):
             for i in range(N):
                 W[a, i] = cross[e, i, a]
-        ye, reported = y[e // every_y], seen[e // every_y]
+        ye, reported = y[e * y.shape[0] // n], seen[e * y.shape[0] // n]
         distance[e], log[e] = _correct(X[e], P[e], ye, reported, mean[e], S[e], W, U, white, X1[e], P1[e], nu[e], S1[e])
         for a in range(m - 1, -1, -1):  # K' = U^-1 W
             for i in range(N):
@@ -431,44 +387,18 @@ def correct(X, P, y, seen, mean, cross, S, X1, P1, nu, S1, K, distance, log):
                 K[e, i, a] = W[a, i]
 
 
-@compiled(void(boolean, I1, V, M3, V, M, M, M3))
-def images(moving, integers, reals, X, t, u, known, out):
+@compiled(void(boolean, *MODEL, M3, V, M, M, M3))
+def images(moving, integers, reals, step, offset, direction, X, t, u, known, out):
     """f (moving) or h of the points X (n, points, N)."""
-    c = _layout(integers, reals)
     n, points, N = X.shape
-    if n == 0:
+    if n == 0 or points == 0:
         return
-    _check(c, n, N, t, u, known)
-    w = _work(c, c.n_x if moving else c.sensors.size)
-    every_t, every_u, every_d = n // t.size, n // u.shape[0], n // known.shape[0]
+    _check(integers, step, X[:, 0].copy(), t, u, known)
     for e in range(n):
-        line = e % c.offset.shape[0]
-        for i in range(points):
-            _image(c, moving, line, t[e // every_t], X[e, i], u[e // every_u], known[e // every_d], w, out[e, i])
-            if moving:
-                for j in range(c.n_x, N):
-                    out[e, i, j] = X[e, i, j]
-
-
-@compiled(void(boolean, I1, V, M, V, M, M, M, M3))
-def jacobian(moving, integers, reals, X, t, u, known, value, J):
-    """f (moving) or h of X (n, N) and its Jacobian."""
-    c = _layout(integers, reals)
-    n, N, m = X.shape[0], X.shape[1], c.n_x if moving else c.sensors.size
-    if n == 0:
-        return
-    _check(c, n, N, t, u, known)
-    w = _work(c, m)
-    every_t, every_u, every_d = n // t.size, n // u.shape[0], n // known.shape[0]
-    for e in range(n):
-        line = e % c.offset.shape[0]
-        _differences(c, moving, line, t[e // every_t], X[e], u[e // every_u], known[e // every_d], w)
-        for a in range(m):
-            value[e, a] = w.centre[a]
-            for j in range(N):
-                J[e, a, j] = w.first[j, a]
+        line = e % offset.shape[0]
+        te, ue, de = t[e * t.size // n], u[e * u.shape[0] // n], known[e * known.shape[0] // n]
+        _images(moving, integers, reals, offset[line], direction[line], te, X[e], ue, de, out[e])
         if moving:
-            for a in range(m, N):
-                value[e, a] = X[e, a]
-                for j in range(N):
-                    J[e, a, j] = 1.0 if j == a else 0.0
+            for i in range(points):
+                for j in range(integers[4], N):
+                    out[e, i, j] = X[e, i, j]
