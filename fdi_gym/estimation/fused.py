@@ -174,29 +174,30 @@ def _rule(name: str) -> int:
     return RULES[name]
 
 
-def _call(kernel: Any, *arguments: Any) -> None:
-    """Call a kernel. What it does not take as it lies (another type or order, read-only) it gets as a copy."""
+def _call(kernel: Any, head: tuple[Any, ...], *arrays: Any) -> None:
+    """Call a kernel. An array that it does not take as it lies (its type or order, read-only) it gets as a copy."""
     try:
-        kernel(*arguments)
+        kernel(*head, *arrays)
     except TypeError:
-        kernel(*(_plain(a) if isinstance(a, np.ndarray) else a for a in arguments))
-
-
-def _plain(a: Array) -> Array:
-    return np.array(a, order="C") if a.dtype in (bool, np.int64) else contiguous(a)
+        plain = [np.array(a, order="C") if np.asarray(a).dtype == bool else contiguous(a) for a in arrays]
+        try:
+            kernel(*head, *plain)
+        except TypeError:
+            shapes = [f"{a.dtype} {a.shape}" for a in plain]
+            raise TypeError(f"the arrays need the documented dimensions, and `seen` bool; not {', '.join(shapes)}") from None
 
 
 def f(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> Array:
     """The points X (n, points, N) one sample after t (n,) [s], without noise: (n, points, N)."""
     moved = np.empty(X.shape)
-    _call(kernels.images, True, *model.constants, X, t, u, model.unmeasured if d is None else d, moved)
+    _call(kernels.images, (True, *model.constants), X, t, u, model.unmeasured if d is None else d, moved)
     return moved
 
 
 def h(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> Array:
     """What the sensors read at the points X (n, points, N) at t (n,) [s], without noise: (n, points, m)."""
     y = np.empty((*X.shape[:2], model.m))
-    _call(kernels.images, False, *model.constants, X, t, u, model.unmeasured if d is None else d, y)
+    _call(kernels.images, (False, *model.constants), X, t, u, model.unmeasured if d is None else d, y)
     return y
 
 
@@ -244,7 +245,7 @@ def predict(
     """
     X1, P1 = np.empty(X.shape), np.empty(P.shape)
     known = model.unmeasured if d is None else d
-    _call(kernels.predict, _rule(rule), *model.constants, model.limit, model.linear, X, P, t, u, known, Q, X1, P1)
+    _call(kernels.predict, (_rule(rule), *model.constants, model.limit, model.linear), X, P, t, u, known, Q, X1, P1)
     return X1, P1
 
 
@@ -273,7 +274,7 @@ def update(
     nis, log = np.empty(n), np.empty(n)
     known = model.unmeasured if d is None else d
     _call(
-        kernels.update, _rule(rule), *model.constants, model.H, X, P, t, u, known, y, seen, R,
+        kernels.update, (_rule(rule), *model.constants, model.H), X, P, t, u, known, y, seen, R,
         X1, P1, nu, S, nis, log,
     )  # fmt: skip
     return Updated(X1, P1, nu, S, nis, log)
@@ -297,5 +298,5 @@ def correct(X: Array, P: Array, mean: Array, cross: Array, S: Array, y: Array, s
     n, m = mean.shape
     X1, P1, K = np.empty(X.shape), np.empty(P.shape), np.empty((n, X.shape[1], m))
     nu, S1, nis, log = np.empty((n, m)), np.empty((n, m, m)), np.empty(n), np.empty(n)
-    _call(kernels.correct, X, P, y, seen, mean, cross, S, X1, P1, nu, S1, K, nis, log)
+    _call(kernels.correct, (), X, P, y, seen, mean, cross, S, X1, P1, nu, S1, K, nis, log)
     return Corrected(X1, P1, nu, S1, nis, log, K)

@@ -279,7 +279,7 @@ def predict(rule, integers, reals, step, offset, direction, limit, plant, X, P, 
                 else:
                     moved = 0.5 * (P[e, i, j] + P[e, j, i])
                 P1[e, i, j] = moved + Qe[i, j]
-                P1[e, j, i] = moved + Qe[j, i]
+                P1[e, j, i] = P1[e, i, j]
         for i in range(N):
             if P1[e, i, i] > limit[i]:
                 shrink = np.sqrt(limit[i] / P1[e, i, i])
