@@ -26,14 +26,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi_gym.estimation import fused_kernels as kernels
+from fdi_gym.estimation.fused_moments import CENTRAL_DIFFERENCE, EXTENDED, UNSCENTED
 from fdi_gym.plant import Array, Plant, contiguous
 
 STEP = 1e-3  # of the central differences along the axes, in units of the entries' scales
-RULES = {
-    "extended": kernels.EXTENDED,
-    "unscented": kernels.UNSCENTED,
-    "central difference": kernels.CENTRAL_DIFFERENCE,
-}  # fmt: skip
+RULES = {"extended": EXTENDED, "unscented": UNSCENTED, "central difference": CENTRAL_DIFFERENCE}
 
 
 class Model(NamedTuple):
@@ -175,16 +172,18 @@ def _rule(name: str) -> int:
 
 
 def _call(kernel: Any, head: tuple[Any, ...], *arrays: Any) -> None:
-    """Call a kernel. An array that it does not take as it lies (its type or order, read-only) it gets as a copy."""
+    """Call a kernel with the arrays in the order and type that it takes; a copy only of what is not so, or read-only."""
+    plain = [np.ascontiguousarray(a, float) for a in arrays]
     try:
-        kernel(*head, *arrays)
+        kernel(*head, *plain)
     except TypeError:
-        plain = [np.array(a, order="C") if np.asarray(a).dtype == bool else contiguous(a) for a in arrays]
+        plain = [a if a.flags.writeable else a.copy() for a in plain]
+        head = tuple(a.copy() if isinstance(a, np.ndarray) and not a.flags.writeable else a for a in head)
         try:
             kernel(*head, *plain)
         except TypeError:
-            shapes = [f"{a.dtype} {a.shape}" for a in plain]
-            raise TypeError(f"the arrays need the documented dimensions, and `seen` bool; not {', '.join(shapes)}") from None
+            shapes = ", ".join(str(a.shape) for a in plain)
+            raise TypeError(f"the arrays need the documented dimensions, not {shapes}, and `seen` bool") from None
 
 
 def f(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> Array:
@@ -274,7 +273,7 @@ def update(
     nis, log = np.empty(n), np.empty(n)
     known = model.unmeasured if d is None else d
     _call(
-        kernels.update, (_rule(rule), *model.constants, model.H), X, P, t, u, known, y, seen, R,
+        kernels.update, (_rule(rule), *model.constants, model.H, np.ascontiguousarray(seen)), X, P, t, u, known, y, R,
         X1, P1, nu, S, nis, log,
     )  # fmt: skip
     return Updated(X1, P1, nu, S, nis, log)
@@ -298,5 +297,5 @@ def correct(X: Array, P: Array, mean: Array, cross: Array, S: Array, y: Array, s
     n, m = mean.shape
     X1, P1, K = np.empty(X.shape), np.empty(P.shape), np.empty((n, X.shape[1], m))
     nu, S1, nis, log = np.empty((n, m)), np.empty((n, m, m)), np.empty(n), np.empty(n)
-    _call(kernels.correct, (), X, P, y, seen, mean, cross, S, X1, P1, nu, S1, K, nis, log)
+    _call(kernels.correct, (np.ascontiguousarray(seen),), X, P, y, mean, cross, S, X1, P1, nu, S1, K, nis, log)
     return Corrected(X1, P1, nu, S1, nis, log, K)
