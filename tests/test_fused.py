@@ -1,5 +1,6 @@
 """The compiled Gaussian step and the decision automaton, against textbook formulas in NumPy."""
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -398,6 +399,15 @@ def test_any_array_will_do():
         assert np.array_equal(a, b)
 
 
+def test_a_copied_model_finds_the_compiled_code_again():
+    """What is pickled holds no address; whoever unpickles it asks the plant for its own."""
+    case = Case("MissilePitch")
+    assert not case.model.__reduce__()[1][2][0][:3].any()
+    again = copy.copy(case.model)
+    for a, b in zip(case.predict("unscented", model=again), case.predict("unscented"), strict=True):
+        assert np.array_equal(a, b)
+
+
 def test_an_empty_batch_is_one():
     case = Case("DCMotor")
     none = {name: getattr(case, name)[:0] for name in ("X", "P", "t", "u", "d")}
@@ -446,6 +456,7 @@ def test_other_bad_input_is_refused():
         fused.jacobian_f(case.model, case.X[:, :4], case.t, case.u)
     for changes, says in (
         ({"scale": case.scale[:-1]}, "scale needs 6"), ({"scale": -case.scale}, "positive"),
+        ({"entries": [0.5, 1.0, 2.0]}, "list of integers"), ({"entries": np.ones((1, 3), int)}, "list of integers"),
         ({"entries": [0, 0, 1]}, "different positions"), ({"entries": [0, 1, 3]}, "from 0 to 2"),
         ({"sensors": [2]}, "sensors"), ({"disturbances": [-1]}, "disturbances"), ({"limit": -case.scale}, "limit"),
         ({"limit": [np.nan] * 6}, "limit"), ({"H": np.zeros((2, 5))}, "H needs"),

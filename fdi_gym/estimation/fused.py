@@ -20,30 +20,20 @@ line). d is what is known of all the plant's disturbances, None where nothing is
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from fdi_gym.estimation import fused_kernels as kernels
+from fdi_gym.estimation.fused_model import Model, bind
 from fdi_gym.estimation.fused_moments import CENTRAL_DIFFERENCE, EXTENDED, UNSCENTED
-from fdi_gym.plant import Array, Plant, contiguous
+from fdi_gym.plant import Array
 
-STEP = 1e-3  # of the central differences along the axes, in units of the entries' scales
+__all__ = [
+    "RULES", "Corrected", "Model", "Updated", "bind", "correct", "f", "h", "jacobian_f", "jacobian_h", "predict", "update",
+]  # fmt: skip
+
 RULES = {"extended": EXTENDED, "unscented": UNSCENTED, "central difference": CENTRAL_DIFFERENCE}
-
-
-class Model(NamedTuple):
-    """A plant's augmented model with its constants packed for the kernels; made by `bind`."""
-
-    plant: Plant  # keeps its compiled equations alive
-    m: int  # sensors
-    constants: tuple[Array, Array, Array, Array, Array]  # what tells f and h, in the kernels' order
-    step: Array  # (N,) of the differences along the axes
-    limit: Array  # (N,)
-    linear: Array  # (n_x, ...), or (0, 0) where the plant is not linear
-    H: Array  # (m, N), or (0, N) where the sensors are not
-    unmeasured: Array  # (1, n_D) zeros
 
 
 class Updated(NamedTuple):
@@ -67,102 +57,6 @@ class Corrected(NamedTuple):
     nis: Array  # (n,)
     log_likelihood: Array  # (n,)
     K: Array  # (n, N, m), 0 for what was not seen
-
-
-def bind(
-    plant: Plant,
-    *,
-    scale: Sequence[float] | Array,
-    entries: Sequence[int] | Array,
-    disturbances: Sequence[int] | Array = (),
-    sensors: Sequence[int] | Array | None = None,
-    limit: Sequence[float] | Array | None = None,
-    lines: tuple[Array, Array] | None = None,
-    H: Array | None = None,
-) -> Model:
-    """The model of [x; m; d] of a plant.
-
-    Args:
-        plant: The plant.
-        scale: Typical size of each entry of X (N,); the differences along the axes take a thousandth of it.
-        entries: Positions (p,) in theta that the faults move.
-        disturbances: Positions (n_d,) in the plant's disturbances of those in X.
-        sensors: Positions (m,) in the plant's outputs of those that the filter hears. Default: all.
-        limit: Largest variance (N,) that a prediction leaves an entry; where it is passed the entry's row and column
-            shrink, so that correlations stay. Default: none.
-        lines: Offsets (lines, p) and directions (lines, p, n_m). Default: m is the deviation of theta[entries] itself.
-        H: (m, N) where the sensors are H X whatever u, t and d are: they are then not evaluated. Default: they are.
-
-    Raises:
-        ValueError: A position does not exist, or an array has the wrong shape or values that are no numbers.
-    """
-    n_x, n_theta, n_D = len(plant.states), len(plant.theta), len(plant.disturbances)
-    where = {
-        "entries": _positions("entries", entries, n_theta),
-        "disturbances": _positions("disturbances", disturbances, n_D),
-        "sensors": _positions("sensors", range(len(plant.outputs)) if sensors is None else sensors, len(plant.outputs)),
-    }
-    p, n_d, m = (len(a) for a in where.values())
-    offset, direction = (np.zeros((1, p)), np.eye(p)[None]) if lines is None else (np.array(a, float) for a in lines)
-    if offset.ndim != 2 or direction.ndim != 3 or direction.shape[:2] != offset.shape or offset.shape[1] != p:
-        raise ValueError(
-            f"lines are offsets (lines, {p}) and directions (lines, {p}, n_m); not {offset.shape}, {direction.shape}"
-        )
-    N = n_x + direction.shape[2] + n_d
-    size, widest = np.array(scale, float), np.full(N, np.inf) if limit is None else np.array(limit, float)
-    observed = np.zeros((0, N)) if H is None else np.array(H, float)
-    if size.shape != (N,) or not (np.isfinite(size) & (size > 0)).all():
-        raise ValueError(f"scale needs {N} positive numbers, not {scale}")
-    if widest.shape != (N,) or not (widest >= 0).all():
-        raise ValueError(f"limit needs {N} numbers that are not negative, not {limit}")
-    if H is not None and (observed.shape != (m, N) or not np.isfinite(observed).all()):
-        raise ValueError(f"H needs the shape ({m}, {N}) and finite numbers, not {observed.shape}")
-    dynamics, output, *_, project, _ = plant.addresses
-    sizes = (plant.substeps, n_x, len(plant.outputs), n_theta, n_D, p, n_d, m, len(plant.commands))
-    integers = np.concatenate([[dynamics, output, project, *sizes], *where.values()]).astype(np.int64)
-    reals = np.concatenate([[plant.dt], plant.nominal_theta, plant.nominal_p])
-    constants = (integers, reals, STEP * size, contiguous(offset), contiguous(direction))
-    linear = _linear(plant, where["entries"])
-    return Model(plant, m, constants, STEP * size, widest, linear, contiguous(observed), np.zeros((1, n_D)))
-
-
-def _positions(name: str, given: Any, count: int) -> Array:
-    positions = np.array(given, dtype=np.int64).reshape(-1)
-    if len(set(positions.tolist())) < len(positions) or not all(0 <= i < count for i in positions):
-        raise ValueError(f"{name} are different positions from 0 to {count - 1}, not {positions.tolist()}")
-    return positions
-
-
-def _linear(plant: Plant, entries: Array) -> Array:
-    """[g, A, B, G, E[0], E[1], ...] of x+ = g + A x + B u + G d + (E[0] + sum u_k E[1 + k]) dtheta; (0, 0) if not so.
-
-    Read off by unit steps, and compared with the plant at random points, since a declaration may be wrong.
-    """
-    if not plant.linear:
-        return np.zeros((0, 0))
-    n_x, n_u, n_D, p = len(plant.states), len(plant.commands), len(plant.disturbances), len(entries)
-    x, u, d = np.zeros((1, n_x)), np.zeros((1, n_u)), np.zeros((1, n_D))
-    theta = np.tile(plant.nominal_theta, (p, 1))
-    theta[np.arange(p), entries] += 1.0
-    g = plant.propagate(0.0, x, u, None, d)[0]
-    A = (plant.propagate(0.0, np.eye(n_x), u, None, d) - g).T
-    B = (plant.propagate(0.0, np.zeros((n_u, n_x)), np.eye(n_u), None, d) - g).T
-    G = (plant.propagate(0.0, np.zeros((n_D, n_x)), u, None, np.eye(n_D)) - g).T
-    commands = np.concatenate([u, np.eye(n_u)])
-    E = np.stack([(plant.propagate(0.0, np.zeros((p, n_x)), c[None], theta, d) - g - B @ c).T for c in commands])
-    E[1:] -= E[0]
-
-    rng = np.random.default_rng(0)
-    x, u, d, z = (rng.standard_normal((16, n)) for n in (n_x, n_u, n_D, p))
-    x *= [s.scale for s in plant.states]
-    theta = np.tile(plant.nominal_theta, (16, 1))
-    theta[:, entries] += z
-    gain = E[0] + np.einsum("nk,kap->nap", u, E[1:])
-    expected = g + x @ A.T + u @ B.T + np.einsum("nap,np->na", gain, z) + d @ G.T
-    found = plant.propagate(rng.uniform(0, 100, 16), x, u, theta, d)
-    if not np.allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(found).max()):
-        return np.zeros((0, 0))
-    return contiguous(np.concatenate([g[:, None], A, B, G, *E], axis=1))
 
 
 def _rule(name: str) -> int:
