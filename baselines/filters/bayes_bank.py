@@ -189,7 +189,7 @@ def bayes_bank(
         return int(np.clip((k.max() - 1 - first_onset) // grid + 1, 0, T))
 
     def predict(s: Onsets, at: Interval) -> Onsets:
-        return begin(s, at.k - 1, at.u)._replace(healthy=kalman_filter.predict(f, s.healthy, at.u))
+        return begin(s, at.k - 1, at.u)._replace(healthy=kalman_filter.predict(f, plant, s.healthy, at))
 
     def update(s: Onsets, at: Interval, y: Array, seen: Array) -> Onsets:
         healthy, m = kalman_filter.correct(f, s.healthy, y, seen), count(at.k)

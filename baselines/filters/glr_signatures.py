@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import AugmentedModel, Interval, augmented
+from fdi_gym.estimation.augmented import AugmentedModel, Interval, augmented, plus_held_commands
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_labels
@@ -119,7 +119,7 @@ def glr_filter(plant: Plant, model: AugmentedModel, size: Array, onsets: int, sp
                 for a in (M, G, g)
             )
         f = linearised(model, lambda points: model.f(points, at), s.X, low, high, rest)
-        P = symmetric(f.A @ s.P @ T(f.A)) + Q
+        P = plus_held_commands(plant, symmetric(f.A @ s.P @ T(f.A)) + Q, s.X[:, model.x], at)
         return s._replace(X=f.mean, P=P, M=f.A[:, None] @ M + f.E[:, None], G=G, g=g, faults=np.ones_like(s.faults))
 
     def update(s: Ratio, at: Interval, y: Array, seen: Array) -> Ratio:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
+from fdi_gym.estimation.augmented import Interval, plus_held_commands
 from fdi_gym.estimation.kalman import T, solve, symmetric, times, update
 from fdi_gym.estimation.linear import LinearModel, linear_model
 from fdi_gym.plant import Array, Plant
@@ -56,10 +57,11 @@ def start(f: Nominal, plant: Plant, n: int) -> Healthy:
     )  # fmt: skip
 
 
-def predict(f: Nominal, s: Healthy, u: Array) -> Healthy:
-    """Over an interval under the command u (n, n_u)."""
+def predict(f: Nominal, plant: Plant, s: Healthy, at: Interval) -> Healthy:
+    """Over an interval."""
     A = f.model.A
-    return s._replace(x=times(A, s.x) + times(f.model.B, u), P=A @ s.P @ A.T + f.Q)
+    P = plus_held_commands(plant, A @ s.P @ A.T + f.Q, s.x, at)
+    return s._replace(x=times(A, s.x) + times(f.model.B, at.u), P=P)
 
 
 def correct(f: Nominal, s: Healthy, y: Array, seen: Array) -> Healthy:

@@ -153,7 +153,7 @@ def switching_bayes_bank(
             return keep_books(s, k - 1, u) if k - 1 >= START and (k - 1) % GRID == 0 else s
 
         s = by_clock(books, s, at, at.u)
-        return s._replace(healthy=kalman_filter.predict(f, s.healthy, at.u))
+        return s._replace(healthy=kalman_filter.predict(f, plant, s.healthy, at))
 
     def update(s: Switching, at: Interval, y: Array, seen: Array) -> Switching:
         s = s._replace(healthy=kalman_filter.correct(f, s.healthy, y, seen))

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import AugmentedModel, Interval, augmented
+from fdi_gym.estimation.augmented import AugmentedModel, Interval, augmented, plus_held_commands
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_labels
@@ -68,6 +68,7 @@ def two_stage_filter(model: AugmentedModel, first_sample: bool = True) -> Filter
         U = A @ s.V + E
         UPz = U @ s.Pz
         P = symmetric(A @ s.Px @ T(A) + UPz @ T(U)) + Q
+        P = plus_held_commands(model.plant, P, s.state()[:, model.x], at)
         aged = s.Pz + Qz
         shrink = np.sqrt(np.minimum(1.0, model.limit[zs] / np.maximum(np.einsum("npp->np", aged), 1e-300)))
         Pz = shrink[:, :, None] * aged * shrink[:, None, :]

@@ -43,7 +43,8 @@ class Running(NamedTuple):
 
     k: Array  # (n,) number of the sample to come
     begun: Array  # (n,) bool
-    u: Array  # (n, n_u) the last command that was reported
+    u: Array  # (n, n_u) the last command that was reported, and
+    stale: Array  # (n, n_u) for how many samples it has been missing since
     known: Array  # (n, n_known) the last known signals
     filter: Any
     rule: Any
@@ -52,7 +53,8 @@ class Running(NamedTuple):
 def _start(plant: Plant, filter: Filter, rule: Rule, n: int) -> Running:
     known = np.tile([s.nominal for s in plant.known], (n, 1)) if plant.known else np.zeros((n, 0))
     begun = np.full(n, filter.begin is None)
-    return Running(np.zeros(n, np.int64), begun, np.tile(plant.trim_command, (n, 1)), known, filter.start(n), rule.start(n))
+    u = np.tile(plant.trim_command, (n, 1))
+    return Running(np.zeros(n, np.int64), begun, u, np.zeros(u.shape), known, filter.start(n), rule.start(n))
 
 
 def _step(plant: Plant, filter: Filter, rule: Rule, s: Running, obs: Array) -> tuple[Running, Reading, Verdict]:
@@ -60,6 +62,7 @@ def _step(plant: Plant, filter: Filter, rule: Rule, s: Running, obs: Array) -> t
     seen = np.isfinite(y)
     whole = bool(seen.all())
     held: Array | None = None
+    stale = s.stale if np.isfinite(u).all() and not s.stale.any() else np.where(np.isfinite(u), 0.0, s.stale + 1.0)
     if not (np.isfinite(u).all() and np.isfinite(known).all()):
         held = np.any(~np.isfinite(np.concatenate([u, known], axis=1)), axis=1)
         u, known = np.where(np.isfinite(u), u, s.u), np.where(np.isfinite(known), known, s.known)
@@ -70,7 +73,7 @@ def _step(plant: Plant, filter: Filter, rule: Rule, s: Running, obs: Array) -> t
     if plant.measured_disturbance is not None:
         before = np.where(first[:, None], known, s.known)
         d = plant.measured_disturbance((s.k - 1) * plant.dt, before, known)  # type: ignore[arg-type]
-    at = Interval(s.k, u, d, known, held)
+    at = Interval(s.k, u, d, known, held, stale if stale.any() else None)
     state, begun = s.filter, s.begun
     ready = begun & ~first
     if ready.all():
@@ -93,7 +96,7 @@ def _step(plant: Plant, filter: Filter, rule: Rule, s: Running, obs: Array) -> t
     reading = filter.read(state)
     informed = measures if whole else measures & (seen.any(axis=1) if reading.seen is None else reading.seen > 0)
     ruled, verdict = rule.step(s.rule, s.k, reading, informed)
-    return Running(s.k + 1, begun, u, known, state, ruled), reading, verdict
+    return Running(s.k + 1, begun, u, stale, known, state, ruled), reading, verdict
 
 
 def diagnoser_of(plant: Plant, filter: Filter, rule: Rule) -> Diagnoser:

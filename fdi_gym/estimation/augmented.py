@@ -17,6 +17,7 @@ from fdi_gym.estimation.gaussian import Rule
 from fdi_gym.estimation.kalman import Corrected, T, correct, symmetric, times
 from fdi_gym.plant import Array, Plant
 
+HELD = 10  # samples within which a command that is held goes wrong by its typical size
 STEP = 1e-3  # of the central differences, in units of the signals' scales
 WIDEST = 2.0  # the walk never makes a fault's standard deviation larger than this, in units of its typical size
 
@@ -29,11 +30,47 @@ class Interval(NamedTuple):
     d: Array | None  # (n, n_d) the measured disturbance; None where none is
     known: Array  # (n, n_known) what else is known at its end
     held: Array | None = None  # (n,) bool: a command or known signal did not report, its last value stands; None: all did
+    stale: Array | None = None  # (n, n_u) for how many samples in a row each command has been missing; None: none is
 
     def of(self, rows: Array) -> Interval:
         """Of some episodes, each as often as its row is named."""
-        d, held = (None if a is None else a[rows] for a in (self.d, self.held))
-        return Interval(self.k[rows], self.u[rows], d, self.known[rows], held)
+        d, held, stale = (None if a is None else a[rows] for a in (self.d, self.held, self.stale))
+        return Interval(self.k[rows], self.u[rows], d, self.known[rows], held, stale)
+
+
+def plus_held_commands(plant: Plant, P: Array, x: Array, at: Interval) -> Array:
+    """A predicted covariance P (n, N, N) whose first entries are the state's, with what a command that was held adds."""
+    more = held_command_covariance(plant, x, at)
+    if more is None:
+        return P
+    P, n_x = P.copy(), x.shape[1]
+    P[:, :n_x, :n_x] += more
+    return P
+
+
+def held_command_covariance(plant: Plant, x: Array, at: Interval) -> Array | None:
+    """What a command that was not reported adds to the covariance of the state (n, n_x, n_x); None where all were.
+
+    The error of a command that is held grows to its typical size within HELD samples, and it is one error, not white noise:
+    over j samples its effects add up, so that the j-th adds 2 j - 1 times its square.
+
+    Args:
+        plant: The plant.
+        x: The state at the interval's start (n, n_x).
+        at: The interval.
+    """
+    if at.stale is None:
+        return None
+    scale = np.array([s.scale for s in plant.commands])
+    points = at.u[:, None] + STEP * np.concatenate([np.diag(scale), -np.diag(scale)])  # (n, 2 n_u, n_u)
+    n, n_u = at.u.shape
+    t = np.repeat((at.k - 1) * plant.dt, 2 * n_u)
+    d = None if at.d is None else np.repeat(at.d, 2 * n_u, axis=0)
+    moved = plant.propagate(t, np.repeat(x, 2 * n_u, axis=0), points.reshape(-1, n_u), None, d).reshape(n, 2 * n_u, -1)
+    B = (moved[:, :n_u] - moved[:, n_u:]) / (2 * STEP)  # (n, n_u, n_x): by a command's typical size
+    weight = np.sqrt(np.maximum(2.0 * at.stale - 1.0, 0.0)) * np.minimum(at.stale / HELD, 1.0)
+    B = weight[..., None] * B
+    return T(B) @ B
 
 
 class AugmentedModel(NamedTuple):
@@ -114,7 +151,8 @@ class AugmentedModel(NamedTuple):
     def predict(self, rule: Rule, X: Array, P: Array, at: Interval, Q: Array | None = None) -> tuple[Array, Array]:
         """Mean and covariance one sample later."""
         moved = rule(lambda points: self.f(points, at), X, P, self.step)
-        return moved.mean, self.limited(symmetric(moved.P) + (self.Q if Q is None else Q))
+        after = symmetric(moved.P) + (self.Q if Q is None else Q)
+        return moved.mean, self.limited(plus_held_commands(self.plant, after, X[:, self.x], at))
 
     def update(self, rule: Rule, X: Array, P: Array, at: Interval, y: Array, seen: Array) -> Corrected:
         """Update with the measurement y (n, n_y) of the sensors that reported, seen (n, n_y)."""
