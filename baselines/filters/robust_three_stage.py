@@ -39,7 +39,7 @@ LONGEST = 5  # samples for which one estimate counts; over longer intervals it i
 
 
 class RobustThreeStage(NamedTuple):
-    """State of the filter, its estimates of the unknown inputs over the last interval, and how they enter the current one."""
+    """State of the filter, its estimates of the inputs over the last interval, and how they enter the current one."""
 
     x: Array  # (n, n_x)
     P: Array  # (n, n_x, n_x)
