@@ -1,6 +1,5 @@
 """The filters that need nothing but a plant's declaration: model, prior, filters, alarms, calibration."""
 
-import dataclasses
 import inspect
 import itertools
 import json
@@ -8,13 +7,6 @@ import json
 import numpy as np
 import pytest
 from conftest import PLANTS, build
-from scipy.optimize import lsq_linear
-from scipy.stats import betabinom
-
-from baselines.filters import ascdkf, augmented_kf, two_stage_kf
-from fdi_gym.diagnosis import NotApplicableError, diagnosers, make_diagnoser, run
-from fdi_gym.estimation import calibration, unknown_inputs
-from fdi_gym.estimation import prior as prior_file
 from fdi_gym.estimation.alarm import (
     TESTS,
     Declared,
@@ -29,14 +21,20 @@ from fdi_gym.estimation.alarm import (
     glr_test,
     penalties,
 )
+from fdi_gym.estimation.prior import VALIDATION_SEED, flights_of, long_run, prior
+from scipy.optimize import lsq_linear
+from scipy.stats import betabinom
+
+from baselines.filters import augmented_kf, two_stage_kf
+from fdi_gym.diagnosis import NotApplicableError, diagnosers, make_diagnoser, run
+from fdi_gym.estimation import calibration, unknown_inputs
+from fdi_gym.estimation import prior as prior_file
 from fdi_gym.estimation.augmented import augmented
 from fdi_gym.estimation.decision import Manifolds, nearest_of
 from fdi_gym.estimation.gaussian import RULES, advance, start
 from fdi_gym.estimation.linear import linear_model
-from fdi_gym.estimation.prior import VALIDATION_SEED, flights_of, long_run, prior
 from fdi_gym.faults import draw
 from fdi_gym.plants import b747_lateral as b747_file
-from fdi_gym.plants import huav_hover
 from fdi_gym.simulation import simulate
 
 ALL_PLANTS = [*PLANTS, "DCMotor"]
@@ -116,24 +114,6 @@ def test_general_filter_is_the_augmented_kf_with_its_tuning(b747, rule):
         assert s.X == pytest.approx(special.X, rel=1e-9, abs=1e-9)
         assert s.P == pytest.approx(special.P, rel=1e-9, abs=1e-9)
         assert s.X[:, 4:] == pytest.approx(said.estimate[:, k], rel=1e-9, abs=1e-9)
-
-
-def test_general_central_difference_filter_is_the_ascdkf_with_its_tuning():
-    plant = build("HUAVHover")
-    model = augmented(plant, x0_std=huav_hover.X0_STD, z0_std=[2e-3] * 4, z_walk=[7e-4] * 4)
-    P0, Q = model.P0.copy(), model.Q.copy()
-    P0[15:, 15:], Q[:11, :11], Q[15:, 15:] = 0.5**2 * np.eye(2), plant.Q, 0.05**2 * np.eye(2)
-    model = model._replace(P0=P0, Q=Q, R=plant.R, limit=np.full(17, np.inf))
-    obs = flown(plant)[1].obs[:, :120]
-    diagnoser = ascdkf.ascdkf(plant, **plant.tuning["ascdkf"])
-    state = diagnoser.init(2)
-    for k, s in enumerate(followed(model, "central difference", obs, False)):
-        state, _ = diagnoser.update(state, obs[:, k])
-        std = np.sqrt(np.einsum("nii->ni", state[1].P))
-        assert s.X / std == pytest.approx(state[1].x / std, abs=1e-8)
-        assert s.P / (std[:, :, None] * std[:, None]) == pytest.approx(
-            state[1].P / (std[:, :, None] * std[:, None]), abs=1e-8
-        )
 
 
 def test_walk_widens_no_fault_beyond_its_limit(b747):
@@ -523,56 +503,3 @@ def test_builds_or_says_why_not(monkeypatch, plant_id, name):
     if not reason:
         with pytest.raises(ValueError, match="unknown scenario"):
             entry.build(plant, **{**entry.settings, **known, "process": "no such"})
-
-
-@pytest.mark.parametrize(("name", "plant_id", "reason"), [
-    ("three_stage_cdkf", "CMGSatellite", "no unknown input"), ("three_stage_ekf", "MissilePitch", "y = H x"),
-    ("three_stage_cdkf", "DCMotor", "y = H x"), ("ascdkf", "MissilePitch", "y = H x"),
-    ("robust_three_stage_cdkf", "B747Lateral", r"rank H\[B E\] = 5 .* it is 3"),
-    ("robust_three_stage_ekf", "CMGSatellite", r"rank H\[B E\] = 4 .* it is 0"),
-])  # fmt: skip
-def test_reasons_of_the_three_stage_family(name, plant_id, reason):
-    with pytest.raises(NotApplicableError, match=reason):
-        make_diagnoser(name, build(plant_id))
-
-
-@pytest.mark.parametrize("process", ["standard", "gust"])
-@pytest.mark.parametrize("name", ["ascdkf", "three_stage_cdkf", "three_stage_ekf"])
-def test_three_stage_family_is_the_general_augmented_filter_on_the_747(short_calibrations, b747, name, process):
-    """With the process's own prior, where that has a gust; without one it adds a disturbance that is as good as none."""
-    model = augmented(b747, process)
-    model = model._replace(limit=np.full(len(model.limit), np.inf))
-    obs = flown(b747, process)[1].obs[:, :200]
-    said = run(make_diagnoser(name, b747, process=process), obs)
-    for k, s in enumerate(followed(model, "extended", obs, False)):
-        std = np.sqrt(np.einsum("nii->ni", s.P))[:, 4:8]
-        tolerance = 1e-6 if process == "gust" else 0.02
-        assert (s.X[:, 4:8] - said.estimate[:, k]) / std == pytest.approx(np.zeros((2, 4)), abs=tolerance)
-        assert std == pytest.approx(said.estimate_std[:, k], rel=tolerance)
-
-
-def test_flags_are_calibrated_where_the_table_has_no_thresholds(short_calibrations):
-    """On healthy flights, when the first sample is seen."""
-    plant = build("HUAVHover", kappa=0.5)
-    obs = flights_of(plant, "standard", 800_000, 3, False)[1].obs[:, :120]
-    diagnoser = make_diagnoser("three_stage_cdkf", plant)
-    assert not calibration._kept
-    said = run(diagnoser, obs)
-    (thresholds,) = calibration._kept.values()
-    assert np.shape(thresholds) == (4,)
-    assert min(thresholds) > 0
-    assert not said.alarm[:, :10].any()
-
-
-def test_a_plant_brings_tuning_which_a_caller_overrides():
-    plant, entry = build("HUAVHover"), diagnosers()["ascdkf"]
-    assert entry.settings_on(plant) == {"x0_std": huav_hover.X0_STD, **huav_hover.WALKS}
-    assert entry.settings_on(plant, b_step=1.0)["b_step"] == 1.0
-    assert diagnosers()["augmented_ekf_cusum"].settings_on(plant)["decision"] == "cusum"
-    obs = flown(plant)[1].obs[:, :40]
-    theirs = run(make_diagnoser("ascdkf", plant), obs).estimate
-    plain = dataclasses.replace(plant, tuning={})
-    assert np.array_equal(theirs, run(make_diagnoser("ascdkf", plain, **plant.tuning["ascdkf"]), obs).estimate)
-    assert not np.allclose(theirs, run(make_diagnoser("ascdkf", plant, b_step=1e-2), obs).estimate)
-    with pytest.raises(ValueError, match="null has no setting 'gain'"):
-        make_diagnoser("null", dataclasses.replace(plant, tuning={"null": {"gain": 1}}))
