@@ -1,4 +1,4 @@
-"""The family of filters of state, fault and unknown disturbance on any plant: who can run it, and the general filter it is."""
+"""The family of filters of state, fault and unknown disturbance on any plant: who can run it, and which one it is."""
 
 import numpy as np
 import pytest

@@ -164,7 +164,7 @@ def matched_oracle(
             b[i, channel] += np.where(found, size[i, best, f] * s.error[:, f], 0.0)
             own = np.maximum(s.G[i, columns[best, f], columns[best, f]], 1e-9)
             variance[i, channel] += np.where(found, s.error[:, f] ** 2 / own, 0.0)
-        alone = s.g**2 / np.maximum(np.einsum("nii->ni", s.G), 1e-12)
+        alone = (s.g**2 / np.maximum(np.einsum("nii->ni", s.G), 1e-12)).reshape(n, count, p).max(axis=1)
         x = plant.trim_state + s.x[:, :n_x]
         reading = Reading(b, variance[:, :, None] * np.eye(p), x, s.P[:, :n_x, :n_x], signals={"energy": alone, "on": on})
         return of_all_channels(plant, inputs, reading)
