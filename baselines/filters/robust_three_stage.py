@@ -118,7 +118,7 @@ def update(s: RobustThreeStage, y: Array, seen: Array, H: Array, R: Array) -> Ro
     variance = [np.concatenate([np.einsum("nii->ni", c) for c in (f.cov_b, f.cov_d)], axis=1) for f in (found, best)]
     with np.errstate(invalid="ignore"):
         enough = ((variance[0] > 0) & (variance[0] <= LOSS**2 * variance[1])).all(axis=1)
-    return choose(whole | enough, found, s._replace(seen=np.zeros_like(s.seen)))
+    return choose(np.logical_or(whole, enough), found, s._replace(seen=np.zeros_like(s.seen)))
 
 
 def input_gain(f: Propagated, H: Array, Q: Array, R: Array) -> tuple[Array, Array]:

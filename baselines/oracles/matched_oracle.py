@@ -51,7 +51,7 @@ def steady_filter(plant: Plant, inputs: FaultInputs, d_step: float) -> SteadyFil
     ahead, back = (plant.propagate(0.0, np.tile(plant.trim_state, (len(steps), 1)), plant.trim_command + sign * steps)
                    for sign in (1, -1))  # fmt: skip
     Ha = np.hstack([H, np.zeros((len(H), q))])
-    Q = scipy.linalg.block_diag(plant.Q, d_step**2 * np.eye(q))
+    Q = np.asarray(scipy.linalg.block_diag(plant.Q, d_step**2 * np.eye(q)))
     P = scipy.linalg.solve_discrete_are(A.T, Ha.T, Q, plant.R)
     C = Ha @ P @ Ha.T + plant.R
     return SteadyFilter(A, stack((ahead - back).T / 2e-5), stack(at.B), Ha, Q, P, np.linalg.solve(C, Ha @ P).T, C)
