@@ -16,11 +16,12 @@ import numpy as np
 import scipy.linalg
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-from fdi_gym.diagnosis import find_diagnoser
+from fdi_gym.diagnosis import make_diagnoser
 from fdi_gym.plant import load_plant
-from fdi_gym.plants.huav_hover import DT, X0_STD, dynamics, episode
+from fdi_gym.plants.huav_hover import DT, dynamics, episode
 from fdi_gym.simulation import simulate
 
+X0_STD = (*[0.1] * 3, *[0.02] * 6, *[0.005] * 2)  # as in baselines/tuning/HUAVHover.json
 NAMES = ("ascdkf", "three_stage_cdkf", "three_stage_ekf", "robust_three_stage_cdkf", "robust_three_stage_ekf",
          "hypothesis_bank")  # fmt: skip
 
@@ -70,8 +71,7 @@ def measure(batch=64, steps=50, rounds=5):
     obs = simulate(plant, [episode(seed) for seed in range(batch)]).obs
     y, u, _ = plant.split(obs)
     states, best = {}, {}
-    built = {name: find_diagnoser(name) for name in NAMES}
-    built = {name: entry.build(plant, **entry.settings_on(plant)) for name, entry in built.items()}
+    built = {name: make_diagnoser(name, plant) for name in NAMES}
     for name, diagnoser in built.items():
         states[name] = diagnoser.init(batch)
         for k in range(5):

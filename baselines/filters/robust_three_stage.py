@@ -35,10 +35,11 @@ from fdi_gym.estimation.kalman import T, masked, right_divide, solve, symmetric,
 from fdi_gym.plant import Array, Plant
 
 LOSS = 1.1  # sensors may be missing as long as no input's standard deviation grows by more than this factor
+LONGEST = 5  # samples for which one estimate counts; over longer intervals it is not the sensors' noise that matters
 
 
 class RobustThreeStage(NamedTuple):
-    """State of the filter, its estimates of the unknown inputs over the last interval, and how they enter the current one."""
+    """State of the filter, its estimates of the inputs over the last interval, and how they enter the current one."""
 
     x: Array  # (n, n_x)
     P: Array  # (n, n_x, n_x)
@@ -49,6 +50,7 @@ class RobustThreeStage(NamedTuple):
     B: Array  # (n, n_x, p) effect on x of the inputs since the last sample that was used
     E: Array  # (n, n_x, q)
     seen: Array  # (n,) sensors that were used at the last sample
+    span: Array  # (n,) samples that the current interval spans
 
 
 def start(n: int, x0: Array, P0: Array, cov_b: Array, cov_d: Array) -> RobustThreeStage:
@@ -57,7 +59,7 @@ def start(n: int, x0: Array, P0: Array, cov_b: Array, cov_d: Array) -> RobustThr
     return RobustThreeStage(
         np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1)), np.zeros((n, p)), np.zeros((n, q)),
         np.tile(cov_b, (n, 1, 1)), np.tile(cov_d, (n, 1, 1)), np.zeros((n, n_x, p)), np.zeros((n, n_x, q)),
-        np.zeros(n, np.int64),
+        np.zeros(n, np.int64), np.zeros(n, np.int64),
     )  # fmt: skip
 
 
@@ -67,7 +69,7 @@ def predict(s: RobustThreeStage, f: Propagated, Q: Array) -> RobustThreeStage:
     if s.B.any() or s.E.any():  # the last sample was not used
         carried = f.carry(np.concatenate([s.B, s.E], axis=2))
         B, E = B + carried[..., : B.shape[-1]], E + carried[..., B.shape[-1] :]
-    return s._replace(x=f.x, P=f.P + Q, B=B, E=E)
+    return s._replace(x=f.x, P=f.P + Q, B=B, E=E, span=np.where(s.seen > 0, 1, s.span + 1))
 
 
 def solved(s: RobustThreeStage, y: Array, seen: Array, H: Array, R: Array) -> RobustThreeStage:
@@ -102,7 +104,7 @@ def solved(s: RobustThreeStage, y: Array, seen: Array, H: Array, R: Array) -> Ro
     P = symmetric(Pxb + V12 @ Pb @ T(V12) + V13 @ Pd @ T(V13))
     return RobustThreeStage(
         x, P, b + times(V23, d), d, symmetric(Pb + V23 @ Pd @ T(V23)), Pd, np.zeros_like(s.B), np.zeros_like(s.E),
-        seen.sum(axis=1),
+        seen.sum(axis=1), s.span,
     )  # fmt: skip
 
 
@@ -116,7 +118,7 @@ def update(s: RobustThreeStage, y: Array, seen: Array, H: Array, R: Array) -> Ro
     variance = [np.concatenate([np.einsum("nii->ni", c) for c in (f.cov_b, f.cov_d)], axis=1) for f in (found, best)]
     with np.errstate(invalid="ignore"):
         enough = ((variance[0] > 0) & (variance[0] <= LOSS**2 * variance[1])).all(axis=1)
-    return choose(whole | enough, found, s._replace(seen=np.zeros_like(s.seen)))
+    return choose(np.logical_or(whole, enough), found, s._replace(seen=np.zeros_like(s.seen)))
 
 
 def input_gain(f: Propagated, H: Array, Q: Array, R: Array) -> tuple[Array, Array]:
@@ -234,7 +236,7 @@ def robust_three_stage_filter(plant: Plant, known: Known, rule: str) -> Filter:
         return update(s, y[:, known.sensors], seen[:, known.sensors], known.H, known.R)
 
     def read(s: RobustThreeStage) -> Reading:
-        return Reading(s.b, s.cov_b, s.x, s.P, seen=s.seen, signals={"disturbance": s.d})
+        return Reading(s.b, s.cov_b, s.x, s.P, seen=s.seen, span=np.minimum(s.span, LONGEST), signals={"disturbance": s.d})
 
     return Filter(lambda n: start(n, known.x0, known.P0, cov_b, cov_d), ahead, measured, read, first_sample=False)
 

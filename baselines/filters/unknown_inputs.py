@@ -142,9 +142,8 @@ def decided(
         rule = by_channels(plant, inputs, alpha, np.array(found if thresholds is None else thresholds))
     elif decision == "distance":
         if len(inputs.names) < len(plant.estimated):
-            raise NotApplicableError(
-                f"the distance to labels needs all fault channels of {plant.id}: {', '.join(s.name for s in plant.estimated)}"
-            )
+            names = ", ".join(s.name for s in plant.estimated)
+            raise NotApplicableError(f"the distance to labels needs all fault channels of {plant.id}: {names}")
         rule = by_labels(plant, calibration)
     else:
         raise ValueError(f"unknown decision {decision!r}; there are channels, distance")

@@ -51,7 +51,7 @@ def steady_filter(plant: Plant, inputs: FaultInputs, d_step: float) -> SteadyFil
     ahead, back = (plant.propagate(0.0, np.tile(plant.trim_state, (len(steps), 1)), plant.trim_command + sign * steps)
                    for sign in (1, -1))  # fmt: skip
     Ha = np.hstack([H, np.zeros((len(H), q))])
-    Q = scipy.linalg.block_diag(plant.Q, d_step**2 * np.eye(q))
+    Q = np.asarray(scipy.linalg.block_diag(plant.Q, d_step**2 * np.eye(q)))
     P = scipy.linalg.solve_discrete_are(A.T, Ha.T, Q, plant.R)
     C = Ha @ P @ Ha.T + plant.R
     return SteadyFilter(A, stack((ahead - back).T / 2e-5), stack(at.B), Ha, Q, P, np.linalg.solve(C, Ha @ P).T, C)
@@ -164,7 +164,7 @@ def matched_oracle(
             b[i, channel] += np.where(found, size[i, best, f] * s.error[:, f], 0.0)
             own = np.maximum(s.G[i, columns[best, f], columns[best, f]], 1e-9)
             variance[i, channel] += np.where(found, s.error[:, f] ** 2 / own, 0.0)
-        alone = s.g**2 / np.maximum(np.einsum("nii->ni", s.G), 1e-12)
+        alone = (s.g**2 / np.maximum(np.einsum("nii->ni", s.G), 1e-12)).reshape(n, count, p).max(axis=1)
         x = plant.trim_state + s.x[:, :n_x]
         reading = Reading(b, variance[:, :, None] * np.eye(p), x, s.P[:, :n_x, :n_x], signals={"energy": alone, "on": on})
         return of_all_channels(plant, inputs, reading)

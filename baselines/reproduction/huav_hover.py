@@ -13,11 +13,8 @@ from typing import Any
 
 import numpy as np
 import tyro
-from fdi_gym.estimation.flags import label_sets
-from fdi_gym.estimation.propagation import fault_inputs
 
-from baselines.filters.flag_thresholds import calibrate
-from baselines.filters.matched_oracle import steady_filter
+from baselines.oracles.matched_oracle import steady_filter
 from baselines.reproduction.huav_reference import (
     BOUNDS,
     KINDS,
@@ -29,7 +26,9 @@ from baselines.reproduction.huav_reference import (
     WRONG_FLAGS,
 )
 from baselines.reproduction.tables import markdown, pieces
-from fdi_gym.diagnosis import Diagnoser, find_diagnoser, guarded
+from fdi_gym.diagnosis import Diagnoser, filtering, make_diagnoser, run
+from fdi_gym.estimation.belief import fault_inputs
+from fdi_gym.estimation.labels import channel_sets
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant, load_plant
 from fdi_gym.plants.huav_hover import CHANNELS, ID, disturbance_rows, episode, fault_free_episode, paper
@@ -45,12 +44,6 @@ NUMBERS = {"bias": "bias", "stuck_at": "stuck at", "stuck_hold": "stuck in place
            "float_free": "drift", "loe": "loe"}  # fmt: skip
 
 
-def build(name: str, plant: Plant, **tuning: Any) -> Diagnoser:
-    """The diagnoser itself: the measurement reads its state."""
-    entry = find_diagnoser(name)
-    return entry.build(plant, **entry.settings_on(plant, **tuning))
-
-
 @dataclasses.dataclass
 class Watched:
     """What a filter made of flights; row k belongs to step k (its estimate from y_{k+1}, u_c,k)."""
@@ -62,31 +55,21 @@ class Watched:
 
 
 def watch(diagnoser: Diagnoser, plant: Plant, channels: tuple[str, ...], obs: Array) -> Watched:
-    """Show the observations to a filter and read its state, under the guard: after a flight has ended it sees the last
-    observation again and again, and may be lost.
+    """What a filter says and its signals, under the guard: after a flight has ended it sees the last observation again and
+    again, and may be lost.
     """
     inputs = fault_inputs(plant, channels)
-    n, samples, p = len(obs), obs.shape[1], len(channels)
-    b, s, d = (np.full((n, samples - 1, width), np.nan) for width in (p, p, 2))
-    found = Watched(b, s, d, np.zeros((n, samples - 1, p), bool))
-    _, sets = label_sets(plant, inputs)
-    guard = guarded(diagnoser, plant)
-    outer = guard.init(n)
-    with np.errstate(all="ignore"):
-        for k in range(samples):
-            outer, said = guard.update(outer, obs[:, k])
-            state = outer[0]
-            if k == 0:
-                continue
-            assert said.estimate is not None
-            found.b[:, k - 1] = said.estimate[:, inputs.estimated]
-            if len(state) == 3:
-                found.s[:, k - 1], found.on[:, k - 1] = state[2].s, state[2].on
-                filtered = state[1]
-                found.d[:, k - 1] = filtered.d if hasattr(filtered, "d") else filtered.x[:, 11 + p :]
-            else:
-                found.on[:, k - 1] = sets[state[1].declared]
-    return found
+    said = run(diagnoser, obs, signals=True)
+    assert said.estimate is not None
+    b, signals = said.estimate[:, 1:, inputs.estimated], said.signals or {}
+    missing = np.full_like(b, np.nan)
+    labels, sets = channel_sets(plant, inputs)
+    position = np.searchsorted(labels, np.maximum(said.label[:, 1:], 0))
+    return Watched(
+        b, signals["smoothed"][:, 1:] if "smoothed" in signals else missing,
+        signals["disturbance"][:, 1:] if "disturbance" in signals else missing[..., :2],
+        signals["channels_on"][:, 1:] > 0 if "channels_on" in signals else sets[position],
+    )  # fmt: skip
 
 
 def rms(x: Array, axis: Any = None) -> Any:
@@ -136,7 +119,7 @@ def scenario_piece(
     channels, plant = SETS[p], load_plant(ID, kappa=kappa)
     scenarios = [paper(number).replace(noise_seed=s) for s in NOISE_SEEDS[:seeds]]
     record = simulate(plant, scenarios)
-    w = watch(build(name, plant, channels=channels, **(tuning or {})), plant, channels, record.obs)
+    w = watch(make_diagnoser(name, plant, channels=channels, **(tuning or {})), plant, channels, record.obs)
     truth = record.target[:, 1:, [CHANNELS.index(c) for c in channels]]
     sets = faulty_steps(scenarios, truth.shape[1], channels)
     faults = windows(scenarios, record.length, channels)
@@ -165,7 +148,7 @@ def random_piece(kappa: float, name: str, count: int) -> dict[str, Any]:
     plant = load_plant(ID, kappa=kappa)
     scenarios = [episode(s) for s in range(count)]
     record = simulate(plant, scenarios)
-    w = watch(build(name, plant), plant, CHANNELS, record.obs)
+    w = watch(make_diagnoser(name, plant), plant, CHANNELS, record.obs)
     steps = w.on.shape[1]
     last = np.where(record.terminated, record.length - 1, record.length)  # a step that ends the flight does not count
     counted = np.arange(steps) < last[:, None]
@@ -185,7 +168,7 @@ def random_piece(kappa: float, name: str, count: int) -> dict[str, Any]:
             first_right += bool(some.size and (rows[some[0]] == wanted).all())
     d = np.array([disturbance_rows(s)[:-1] for s in scenarios])
     quiet = simulate(plant, [fault_free_episode(s) for s in range(6000, 6000 + count)])
-    flags = watch(build(name, plant), plant, CHANNELS, quiet.obs).on
+    flags = watch(make_diagnoser(name, plant), plant, CHANNELS, quiet.obs).on
     kinds: dict[str, list[int]] = {}
     for (*_, kind), waited_for in zip(faults, waited, strict=True):
         entry = kinds.setdefault(kind, [0, 0])
@@ -208,8 +191,12 @@ def random_piece(kappa: float, name: str, count: int) -> dict[str, Any]:
 def threshold_piece(p: int, kappa: float, name: str, count: int) -> list[float]:
     """Thresholds [mrad] from the fault-free flights."""
     plant = load_plant(ID, kappa=kappa)
-    diagnoser = build(name, plant, channels=SETS[p], thresholds=[1.0] * p)
-    return (calibrate(plant, diagnoser, seeds=range(5000, 5000 + count)) / MRAD).tolist()
+    diagnoser = make_diagnoser(name, plant, channels=SETS[p])
+    obs = simulate(plant, [fault_free_episode(s) for s in range(5000, 5000 + count)]).obs
+    most = np.zeros((count, p))
+    for _, verdict in filtering.readings(plant, diagnoser, obs):
+        most = np.maximum(most, np.asarray(verdict.evidence.channels))
+    return (np.quantile(most, 0.99, axis=0) / MRAD).tolist()
 
 
 def bound_piece(kappa: float) -> dict[str, Any]:
@@ -243,17 +230,13 @@ def oracle_piece(kappa: float, count: int) -> dict[str, Any]:
     plant = load_plant(ID, kappa=kappa)
     scenarios = [s for s in map(episode, range(count)) if len(s.faults) == 1]
     record = simulate(plant, scenarios)
-    diagnoser = build("matched_oracle", plant, scenarios=scenarios)
+    diagnoser = make_diagnoser("matched_oracle", plant, scenarios=scenarios)
     n = len(scenarios)
     truth = np.array([CHANNELS.index(s.faults[0].mode) for s in scenarios])
     kinds = np.array([s.faults[0].kind for s in scenarios])
     onset, end = (np.array([getattr(s.faults[0], name) for s in scenarios]) for name in ("onset", "end"))
-    right = np.zeros((n, record.obs.shape[1]), bool)
-    state = diagnoser.init(n)
-    for k in range(record.obs.shape[1]):
-        state, _ = diagnoser.update(state, record.obs[:, k])
-        energy = state[1].g ** 2 / np.maximum(np.einsum("nii->ni", state[1].G), 1e-12)
-        right[:, k] = (energy.argmax(axis=1) == truth) & (energy.max(axis=1) > 10.83)
+    energy = (run(diagnoser, record.obs, signals=True).signals or {})["energy"]
+    right = (energy.argmax(axis=2) == truth[:, None]) & (energy.max(axis=2) > 10.83)
     found = {}
     for name, window in (("0.2", 10), ("0.5", 25), ("1.0", 50), ("2.0", 100), ("rest", 10**6)):
         until = np.minimum(onset + window, record.length if name == "rest" else np.minimum(end, record.length))
@@ -270,7 +253,7 @@ def figure_piece(number: int) -> dict[str, Any]:
     record: Record = simulate(plant, [scenario])
     found: dict[str, Any] = {"true": record.target[0, 1:, 1:].tolist()}
     for name in list(SHORT)[:5]:
-        w = watch(build(name, plant, channels=SETS[3]), plant, SETS[3], record.obs)
+        w = watch(make_diagnoser(name, plant, channels=SETS[3]), plant, SETS[3], record.obs)
         found[name] = {"b": w.b[0].tolist(), "s": w.s[0].tolist()}
     return found
 

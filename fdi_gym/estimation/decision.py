@@ -42,6 +42,7 @@ class Reading(NamedTuple):
     cost: Array | None = None  # (n, labels) how badly each label fits, in the method's own words: -2 log of a likelihood
     probs: Array | None = None  # (n, labels)
     signals: dict[str, Array] | None = None  # (n, ...) each
+    span: Array | None = None  # (n,) samples over which z is the mean, where that is not 1
 
 
 class Evidence(NamedTuple):
@@ -299,7 +300,8 @@ def by_channels(plant: Plant, inputs: FaultInputs, alpha: float, thresholds: Arr
         smooth, declared = state
         assert r.z is not None
         informed = (informed & (k > after.warmup))[:, None]
-        smooth = np.where(informed, (1 - alpha) * smooth + alpha * r.z[:, inputs.estimated], smooth)
+        kept = 1 - alpha if r.span is None else ((1 - alpha) ** r.span)[:, None]
+        smooth = np.where(informed, kept * smooth + (1 - kept) * r.z[:, inputs.estimated], smooth)
         size = np.abs(smooth)
         on = np.ones(size.shape, np.int64)
         declared = declare(declared, on, size > J, size < 0.5 * J, after, np.broadcast_to(informed, size.shape))
