@@ -6,21 +6,27 @@ import msgspec
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.stats import betabinom
 
 from baselines.filters import approximation_detector as detection
 from baselines.filters import augmented_ekf_bank as bank
 from baselines.filters import augmented_ekf_imm as imm
 from baselines.filters import generalised_observer_scheme as isolation
-from baselines.filters import innovation_oracle as oracle
-from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, make_diagnoser, run
-from fdi_gym.estimation import missile_ekf as ekf
-from fdi_gym.estimation import missile_model as model
+from baselines.filters import missile_ekf as ekf
+from baselines.filters import missile_model as model
+from baselines.oracles import innovation_oracle as oracle
+from fdi_gym.diagnosis import NotApplicableError, diagnoser_of, find_diagnoser, make_diagnoser, run
+from fdi_gym.estimation import mixing
+from fdi_gym.estimation.augmented import Interval
+from fdi_gym.estimation.calibration import Persistence
+from fdi_gym.estimation.decision import Reading
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import missile_pitch as missile
 from fdi_gym.simulation import simulate
 from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env
 
+FIVE = (1, 2, 3, 4, 5)
 NAMES = (
     "approximation_detector", "approximation_detector_no_margin", "gos", "gos_strict", "gos_two_class",
     "gos_two_class_strict", "augmented_ekf_bank", "augmented_ekf_bank_unlatched", "augmented_ekf_imm",
@@ -53,14 +59,18 @@ def numbered(plant):
 
 
 def trace(plant, obs, sigma, classes):
-    detector, bank = detection.start(len(obs)), isolation.start(len(obs), len(classes))
-    rows = []
+    """Detector and bank after each sample, for sensors with noise sigma."""
+    rule = isolation.elimination(classes, True)
+    diagnoser = diagnoser_of(plant, isolation.gos_filter(sigma, classes), rule)
+    return [state.filter for state in states(diagnoser, obs)]
+
+
+def states(diagnoser, obs):
+    """The diagnoser's state after each sample."""
+    state = diagnoser.init(len(obs))
     for k in range(obs.shape[1]):
-        sample = model.read(plant, obs[:, k])
-        detector = detection.advance(detector, sample, sigma)
-        bank = isolation.advance(bank, detector, sample, classes)
-        rows.append((detector, bank))
-    return rows
+        state, _ = diagnoser.update(state, obs[:, k])
+        yield state
 
 
 def first(condition):
@@ -120,7 +130,7 @@ def test_study_is_detected_and_isolated_when_it_says(study):
     assert [first(excluded[:, 0, 1]), first(excluded[:, 1, 0])] == [1549, 1321]
     assert not excluded[:, 0, 0].any()
     assert not excluded[:, 1, 1].any()
-    verdict = isolation.strict_verdict(study[-1][1], (1, 2))
+    verdict = isolation.strict_verdict(study[-1][1].started, study[-1][1].excluded, (1, 2))
     assert verdict.tolist() == [1, 2]
 
 
@@ -135,8 +145,8 @@ def test_noise_margin(quiet):
     """On the noise-free flight, with the sensors' sigma."""
     obs = simulate(quiet, [missile.study()]).obs
     rows = trace(quiet, obs, np.array(missile.SIGMA[:2]), (1, 2))
-    assert_allclose(rows[900][0].nu[0], [8.924655737884e-03, 5.966486045777e-02], rtol=1e-10)
-    assert_allclose(rows[2000][0].nu[0], [8.937822389253e-03, 4.638332425118e-02], rtol=1e-10)
+    assert_allclose(rows[900][0].sampled.nu[0], [8.924655737884e-03, 5.966486045777e-02], rtol=1e-10)
+    assert_allclose(rows[2000][0].sampled.nu[0], [8.937822389253e-03, 4.638332425118e-02], rtol=1e-10)
 
 
 def test_approximation_follows_the_fault_function(study, quiet):
@@ -151,14 +161,9 @@ def test_approximation_follows_the_fault_function(study, quiet):
 
 
 def ratios_at(plant, obs, samples):
-    diagnoser = bank.augmented_ekf_bank(plant)
-    state, found, alarm = diagnoser.init(len(obs)), {}, []
-    for k in range(obs.shape[1]):
-        state, said = diagnoser.update(state, obs[:, k])
-        alarm.append(said.alarm)
-        if k in samples:
-            found[k] = (state[1].llr, state[0].z[:, 1:, 2], said.label)
-    return found, np.array(alarm)
+    said = run(bank.augmented_ekf_bank(plant), obs, signals=True)
+    shown = (said.signals["log-likelihood ratios"], said.signals["fault parameters"], said.label)
+    return {k: tuple(array[:, k] for array in shown) for k in samples}, said.alarm.T
 
 
 def test_ekf_bank_on_the_study(plant, quiet):
@@ -199,19 +204,12 @@ ORACLE = {  # (episode, sample): log evidence of labels 1..5 minus that of none
 def test_oracle_evidence(plant, numbered):
     scenarios, obs = numbered
     diagnoser = oracle.innovation_oracle(plant, scenarios=scenarios)
-    state, log = diagnoser.init(2), {}
-    for k in range(2001):
-        state, said = diagnoser.update(state, obs[:, k])
-        if k in (924, 1741, 2000):
-            log[k] = np.log(np.maximum(said.label_probs, 1e-300))
-            active = np.array([k > s.faults[0].onset for s in scenarios])
-            p = oracle.priors([(0.1, 0.7), (0.1, 0.7), (0.05, 0.40), (0.3, 1.0)], (0.15, 2.0), 0.05, 0.0)
-            found = oracle.evidence(state.free, state.window, state.jammed, np.zeros((2, 7)), p).log
-            for (episode, sample), expected in ORACLE.items():
-                if sample == k:
-                    assert active[episode]
-                    assert_allclose(found[episode, 1:] - found[episode, 0], expected, rtol=1e-9, atol=1e-9)
-    assert said.label.tolist() == [5, 2]
+    for k, state in enumerate(states(diagnoser, obs)):
+        for (episode, sample), expected in ORACLE.items():
+            if sample == k:
+                found = state.filter.log[episode]
+                assert_allclose(found[1:] - found[0], expected, rtol=1e-9, atol=1e-9)
+    assert np.argmax(state.filter.log, axis=1).tolist() == [5, 2]
 
 
 def test_evidence_is_the_direct_gaussian_marginal_likelihood(plant):
@@ -281,7 +279,7 @@ def test_no_false_alarm_on_fault_free_flights_and_one_in_each_without_the_margin
 def test_the_true_class_is_never_excluded(plant):
     scenarios, noise = flights(range(40))
     record = simulate(plant, scenarios, noise)
-    bank = trace(plant, record.obs, np.array(missile.SIGMA[:2]), (1, 2, 3, 4, 5))[-1][1]
+    bank = trace(plant, record.obs, np.array(missile.SIGMA[:2]), FIVE)[-1][1]
     label = record.label[:, -1]
     faulty = np.flatnonzero(label)
     assert bank.excluded.any()  # there is something to exclude
@@ -291,79 +289,120 @@ def test_the_true_class_is_never_excluded(plant):
 
 def test_no_fault_means_no_bank(plant):
     scenarios, noise = flights(range(3), faults=False)
-    bank = trace(plant, simulate(plant, scenarios, noise).obs, np.array(missile.SIGMA[:2]), (1, 2, 3, 4, 5))[-1][1]
+    bank = trace(plant, simulate(plant, scenarios, noise).obs, np.array(missile.SIGMA[:2]), FIVE)[-1][1]
     assert not bank.eps.any()
-    assert (isolation.tie_broken(bank, (1, 2, 3, 4, 5)) == isolation.NONE).all()
+    assert (isolation.tie_broken(bank.started, bank.excluded, bank.energy, FIVE) == isolation.NONE).all()
 
 
 def test_strict_verdicts():
-    bank = isolation.start(4, 3)._replace(
-        started=np.array([False, True, True, True]),
-        excluded=np.array([[0, 0, 0], [1, 0, 1], [1, 0, 0], [1, 1, 1]], bool),
-        energy=np.array([[1, 2, 3], [1, 9, 2], [1, 9, 2], [3, 2, 1]], float),
+    started = np.array([False, True, True, True])
+    excluded = np.array([[0, 0, 0], [1, 0, 1], [1, 0, 0], [1, 1, 1]], bool)
+    energy = np.array([[1, 2, 3], [1, 9, 2], [1, 9, 2], [3, 2, 1]], float)
+    strict = isolation.strict_verdict(started, excluded, (1, 2, 4))
+    assert strict.tolist() == [isolation.NONE, 2, isolation.SEVERAL, isolation.ALL]
+    assert isolation.tie_broken(started, excluded, energy, (1, 2, 4)).tolist() == [isolation.NONE, 2, 4, 4]
+
+
+def random_known(rng, n):
+    """What may be known at a sample: everything has reported."""
+    return model.Known(rng.uniform(-0.2, 0.2, n), rng.uniform(-0.2, 0.2, n), rng.uniform(1.5, 3, n), np.zeros(n, bool),
+                       rng.normal(size=n))  # fmt: skip
+
+
+def interval(known):
+    """The interval that ends at a sample of which this is known."""
+    n = len(known.delta)
+    return Interval(np.full(n, 7), np.zeros((n, 2)), None, np.stack([*known[:3], 0 * known.mach], axis=1))
+
+
+def random_filters(rng, n):
+    L = rng.normal(0, 0.03, (n, 6, 6, 6))
+    alpha = rng.uniform(-0.2, 0.2, (n, 6))
+    return ekf.Filters(
+        rng.normal(0, 0.1, (n, 6, 6)), L @ np.swapaxes(L, -1, -2), np.zeros((n, 6)), alpha, random_known(rng, n)
     )
-    assert isolation.strict_verdict(bank, (1, 2, 4)).tolist() == [isolation.NONE, 2, isolation.SEVERAL, isolation.ALL]
-    assert isolation.tie_broken(bank, (1, 2, 4)).tolist() == [isolation.NONE, 2, 4, 4]
 
 
 def test_ekf_prediction_is_the_textbook_one():
     """The two rows that are written out against Phi P Phi' + Q with the whole matrix Phi."""
     rng = np.random.default_rng(2)
     n = 3
-    now, before = (model.Sample(*rng.uniform(-0.2, 0.2, (4, n)), rng.uniform(1.5, 3, n)) for _ in range(2))
-    z = rng.normal(0, 0.1, (n, 6, 6))
-    L = rng.normal(0, 0.1, (n, 6, 6, 6))
-    P = L @ np.swapaxes(L, -1, -2)
-    after = ekf.predict(ekf.Filters(np.ones(n, bool), z, P, np.zeros((n, 6)), before), now)
-    f1, F1 = ekf.rates(z, before)
-    euler = z.copy()
+    filters, now = random_filters(rng, n), random_known(rng, n)
+    after = ekf.predict(filters, interval(now))
+    f1, F1 = ekf.rates(filters.z, filters.known)
+    euler = filters.z.copy()
     euler[..., :2] += 0.01 * f1
-    _, F2 = ekf.rates(euler, now)
+    f2, F2 = ekf.rates(euler, now)
     E = np.zeros((n, 6, 6, 6))
     E[..., :2, :] = 0.01 * (F1 + F2) / 2
     Phi = np.eye(6) + E + E @ E / 2
-    expected = Phi @ P @ np.swapaxes(Phi, -1, -2)
-    bound = model.uncertainty_bound(before.alpha, before.mach)[:, 0]
-    expected[..., 0, 0] += (0.01 * ((0.577 * bound) ** 2 * 0.5 + 1e-8))[:, None]
+    expected = Phi @ filters.P @ np.swapaxes(Phi, -1, -2)
+    bound = model.uncertainty_bound(filters.alpha, filters.known.mach[:, None])[..., 0]
+    expected[..., 0, 0] += 0.01 * ((0.577 * bound) ** 2 * 0.5 + 1e-8)
     expected[..., 1, 1] += 1e-7
     expected[..., 2, 2] += 0.01 * ekf.Q_THETA
     assert_allclose(after.P, expected, rtol=1e-10, atol=1e-15)
+    assert_allclose(after.z[..., :2], filters.z[..., :2] + 0.005 * (f1 + f2), rtol=1e-12)
+    assert np.array_equal(after.z[..., 2:], filters.z[..., 2:])
 
 
 def test_ekf_jacobian_column_of_the_parameter_is_the_derivative():
     rng = np.random.default_rng(3)
-    sample = model.Sample(*rng.uniform(-0.2, 0.2, (4, 5)), rng.uniform(1.5, 3, 5))
+    known = random_known(rng, 5)
     z = rng.normal(0, 0.1, (5, 6, 6))
-    _, F = ekf.rates(z, sample)
+    _, F = ekf.rates(z, known)
     for i in (1, 2, 3, 4, 5):
         up, down = z.copy(), z.copy()
         up[..., i] += 1e-6
         down[..., i] -= 1e-6
-        difference = (ekf.rates(up, sample)[0] - ekf.rates(down, sample)[0]) / 2e-6
+        difference = (ekf.rates(up, known)[0] - ekf.rates(down, known)[0]) / 2e-6
         assert_allclose(F[..., i], difference, rtol=1e-6, atol=1e-8)
 
 
 def test_imm_without_transitions_leaves_the_filters_alone():
     rng = np.random.default_rng(4)
-    L = rng.normal(0, 0.1, (2, 6, 6, 6))
-    filters = ekf.start(2)._replace(z=rng.normal(0, 0.1, (2, 6, 6)), P=L @ np.swapaxes(L, -1, -2))
+    filters = random_filters(rng, 2)
     filters.z[:, 0, 2], filters.P[:, 0, 2, :], filters.P[:, 0, :, 2] = 0, 0, 0
     mu = rng.dirichlet(np.ones(6), 2)
-    mixed = imm.mix(imm.IMM(filters, mu), imm.transition(0.0))
-    assert_allclose(mixed.mu, mu, rtol=1e-12)
-    assert_allclose(mixed.filters.z, filters.z, rtol=1e-12, atol=1e-15)
-    assert_allclose(mixed.filters.P, filters.P, rtol=1e-12, atol=1e-15)
+    c, w = mixing.ahead(mu, imm.transition(0.0))
+    mixed = imm.mixed(filters, w)
+    assert_allclose(c, mu, rtol=1e-12)
+    assert_allclose(mixed.z, filters.z, rtol=1e-12, atol=1e-15)
+    assert_allclose(mixed.P, filters.P, rtol=1e-12, atol=1e-15)
 
 
-def test_imm_mixture_has_the_moments_of_its_parts():
+def test_imm_interaction_is_the_moment_matching_of_its_parts():
+    """Written out: a fault's mode from itself and from health with theta anew, health from all without theta."""
     rng = np.random.default_rng(5)
-    mean, covariance = imm.matched(
-        [np.array([[0.25]]), np.array([[0.75]])],
-        [(np.full((1, 1, 6), 2.0), np.zeros((1, 1, 6, 6))), (np.zeros((1, 1, 6)), np.tile(np.eye(6), (1, 1, 1, 1)))],
-    )
-    draws = np.where(rng.random(200000)[:, None] < 0.25, 2.0, rng.normal(size=(200000, 6)))
-    assert_allclose(mean[0, 0], draws.mean(axis=0), atol=0.02)
-    assert_allclose(covariance[0, 0], np.cov(draws.T), atol=0.03)
+    filters, p = random_filters(rng, 1), 0.3
+    filters.z[:, 0, 2], filters.P[:, 0, 2, :], filters.P[:, 0, :, 2] = 0, 0, 0
+    z, P, mu = filters.z[0], filters.P[0], rng.dirichlet(np.ones(6))
+    Pi = imm.transition(p)
+
+    def matched(weights, means, covariances):
+        mean = sum(w * m for w, m in zip(weights, means, strict=True))
+        return mean, sum(w * (C + np.outer(m - mean, m - mean))
+                         for w, m, C in zip(weights, means, covariances, strict=True))  # fmt: skip
+
+    def anew(j, value, variance):
+        mean, covariance = z[j].copy(), P[j].copy()
+        mean[2], covariance[2], covariance[:, 2] = value, 0.0, 0.0
+        covariance[2, 2] = variance
+        return mean, covariance
+
+    c, w = mixing.ahead(mu[None], Pi)
+    found = imm.mixed(filters, w)
+    assert_allclose(c[0], mu @ Pi)
+    parts = [anew(j, 0.0, 0.0) for j in range(6)]
+    expected = [matched(mu * Pi[:, 0] / c[0, 0], *zip(*parts, strict=True))]
+    means = [None, 0.0, 0.0, 0.1, filters.known.delta[0], 0.3]
+    for j in range(1, 6):
+        begun = anew(0, means[j], imm.RESTART_SD[j] ** 2)
+        shares = [mu[j] * Pi[j, j] / c[0, j], mu[0] * Pi[0, j] / c[0, j]]
+        expected.append(matched(shares, [z[j], begun[0]], [P[j], begun[1]]))
+    for j, (mean, covariance) in enumerate(expected):
+        assert_allclose(found.z[0, j], mean, rtol=1e-12, atol=1e-15)
+        assert_allclose(found.P[0, j], covariance, rtol=1e-12, atol=1e-15)
 
 
 def test_mode_transitions_are_a_distribution():
@@ -373,21 +412,196 @@ def test_mode_transitions_are_a_distribution():
     assert Pi[1, 2] == 0
 
 
-def test_alarm_is_raised_and_released_by_runs_of_samples():
+@pytest.mark.parametrize(("release", "expected"), [(15.0, "....AAAAAAAAAAA....."), (None, "....AAAAAAAAAAAAAAAA")])
+def test_alarm_is_raised_and_released_by_runs_of_samples(release, expected):
     """Label 2 leads by 40 for 6 samples, then by 0: on at the 5th, off at the 10th sample under the release level."""
-    lead, none = np.array([[0.0, 0, 40, 0, 0, 0]]), np.zeros((1, 6))
-    count = np.zeros(1, np.int64)
+    rule = bank.likelihood_ratios(30.0, release, Persistence(5, 1, 10))
+    state, found, informed = rule.start(1), "", np.ones(1, bool)
+    for k in range(20):
+        cost = np.array([[0.0, 0, -80 if k < 6 else 0, 0, 0, 0]])
+        state, said = rule.step(state, np.array([k]), Reading(cost=cost), informed)
+        found += "A" if said.alarm[0] else "."
+        assert said.label[0] == (2 if said.alarm[0] else 0)
+    assert found == expected
 
-    def alarms(release):
-        ratios, seen = bank.Ratios(none, count, count, count, np.zeros(1, bool)), []
-        for k in range(20):  # no memory: forgetting 0
-            ratios = bank.decide(ratios, lead if k < 6 else none, 0.0, 30.0, 5, release, 10)
-            seen.append("A" if ratios.alarm[0] else ".")
-            assert ratios.candidate[0] == 2
-        return "".join(seen)
 
-    assert alarms(15.0) == "....AAAAAAAAAAA....."
-    assert alarms(None) == "....AAAAAAAAAAAAAAAA"
+def test_label_is_the_best_of_the_last_sample_over_the_threshold():
+    rule = bank.likelihood_ratios(30.0, 15.0, Persistence(1, 1, 10))
+    state, found = rule.start(1), []
+    for best, lead in [(2, 40), (3, 20), (3, 40), (1, 20), (5, 0)]:
+        state, said = rule.step(state, np.zeros(1), Reading(cost=-2.0 * lead * np.eye(6)[best][None]), np.ones(1, bool))
+        found.append(int(said.label[0]))
+    assert found == [2, 2, 3, 3, 3]
+
+
+# -- gaps
+
+
+def test_ekf_update_with_missing_sensors_is_that_with_their_rows_removed(plant):
+    rng = np.random.default_rng(6)
+    filters, y, R = random_filters(rng, 4), rng.normal(0, 0.1, (4, 3)), plant.R[:2, :2]
+    filters.z[..., 2] = 0.5 * (ekf.THETA_MIN + ekf.THETA_MAX)
+    seen = np.array([[1, 1, 1], [1, 0, 0], [0, 1, 1], [0, 0, 1]], bool)
+    after = ekf.update(filters, y, seen, R)
+    for i, j in itertools.product(range(3), range(6)):
+        rows = np.flatnonzero(seen[i, :2])
+        z, P, H = filters.z[i, j], filters.P[i, j], np.eye(2, 6)[rows]
+        v, S = y[i, rows] - H @ z, H @ P @ H.T + R[np.ix_(rows, rows)]
+        K = P @ H.T @ np.linalg.inv(S)
+        expected = z + K @ v
+        expected[2] = np.clip(expected[2], ekf.THETA_MIN[j], ekf.THETA_MAX[j])
+        assert_allclose(after.z[i, j], expected, rtol=1e-9, atol=1e-12)
+        assert_allclose(after.P[i, j], P - K @ S @ K.T, rtol=1e-9, atol=1e-12)
+        log = -0.5 * (v @ np.linalg.solve(S, v) + np.log(np.linalg.det(S)))
+        assert after.log_likelihood[i, j] == pytest.approx(log, rel=1e-9)
+    assert np.array_equal(after.z[3], filters.z[3])
+    assert_allclose(after.P[3], filters.P[3], rtol=1e-12)
+    assert not after.log_likelihood[3].any()
+
+
+def test_ekf_knows_nothing_of_the_state_where_the_actuators_are_not_known(plant):
+    """Then the fault parameter keeps its estimate and no sample speaks for or against a label."""
+    rng = np.random.default_rng(7)
+    filters = random_filters(rng, 2)
+    filters.z[..., :2] *= 0.1
+    after = ekf.predict(filters, interval(random_known(rng, 2))._replace(held=np.array([True, False])))
+    assert_allclose(after.P[0, :, :2, :2], np.broadcast_to(np.diag(model.RANGE**2), (6, 2, 2)))
+    assert not after.P[0, :, :2, 2:].any()
+    assert_allclose(after.P[0, :, 3:, 3:], filters.P[0, :, 3:, 3:])
+    y = np.column_stack([after.z[:, 0, :2], np.zeros(2)])
+    done = ekf.update(after, y, np.ones((2, 3), bool), plant.R[:2, :2])
+    assert np.ptp(done.log_likelihood[0]) < 0.02
+    assert np.ptp(done.log_likelihood[1]) > 0.2
+    assert_allclose(done.z[0, :, 2], np.clip(filters.z[0, :, 2], ekf.THETA_MIN, ekf.THETA_MAX), atol=1e-6)
+
+
+def test_oracle_update_with_missing_sensors_is_that_with_their_rows_removed(plant):
+    rng = np.random.default_rng(8)
+    c, R = 5, plant.R[:2, :2]
+    L = rng.normal(0, 0.05, (3, 2, 2))
+    f = oracle.Tracked(rng.normal(size=(3, 2)), L @ np.swapaxes(L, 1, 2), rng.normal(size=(3, 2, c)))
+    y, seen = rng.normal(size=(3, 2)), np.array([[1, 0], [0, 1], [0, 0]], bool)
+    after, told = oracle.update(f, y, seen, R)
+    for i in (0, 1):
+        h, S = f.s[i, i], f.P[i, i, i] + R[i, i]
+        K, v = f.P[i, :, i] / S, y[i, i] - f.x[i, i]
+        assert_allclose(after.x[i], f.x[i] + K * v, rtol=1e-9)
+        assert_allclose(after.P[i], f.P[i] - np.outer(K, f.P[i, i]), rtol=1e-9, atol=1e-12)
+        assert_allclose(after.s[i], f.s[i] - np.outer(K, h), rtol=1e-9)
+        assert_allclose(told.A[i], np.outer(h, h) / S, rtol=1e-9)
+        assert_allclose(told.b[i], h * v / S, rtol=1e-9)
+        assert told.c[i] == pytest.approx(v**2 / S + np.log(S), rel=1e-9)
+    assert not any(part[2].any() for part in told)
+    assert all(np.allclose(a[2], b[2], rtol=1e-12) for a, b in zip(after, f, strict=True))
+
+
+def gappy(obs, kind):
+    """The observations without everything for so many samples in a row, twice; or by the name of the pattern."""
+    obs = obs.copy()
+    if kind == "nothing at sample 0":
+        obs[:, 0] = np.nan
+    elif kind == "alpha every seventh":
+        obs[:, ::7, 0] = np.nan
+    elif kind == "q every seventh":
+        obs[:, ::7, 1] = np.nan
+    elif kind == "known signals every seventh":
+        obs[:, ::7, 3:] = np.nan
+    else:
+        for k in (120, 300):
+            obs[:, k : k + kind] = np.nan
+    return obs
+
+
+PATTERNS = [1, 5, 10, 20, 40, "nothing at sample 0", "alpha every seventh", "q every seventh", "known signals every seventh"]
+
+
+def false_alarms(plant, name, count, patterns):
+    """How many of these healthy flights, 4.2 s long, have an alarm: without gaps, then by pattern."""
+    scenarios, noise = flights(range(count), faults=False)
+    scenarios, noise = [s.replace(steps=420) for s in scenarios], [(w[:420], v[:421]) for w, v in noise]
+    healthy = simulate(plant, scenarios, noise).obs
+    obs = np.concatenate([healthy, *(gappy(healthy, pattern) for pattern in patterns)])
+    return run(make_diagnoser(name, plant), obs).alarm.any(axis=1).reshape(-1, count).sum(axis=1)
+
+
+@pytest.mark.parametrize("name", ["approximation_detector", "gos", "augmented_ekf_bank", "augmented_ekf_bank_unlatched"])
+def test_gaps_raise_no_alarm_on_healthy_flights(plant, name):
+    alarms = false_alarms(plant, name, 8, PATTERNS)
+    assert not alarms.any(), dict(zip([None, *PATTERNS], alarms.tolist(), strict=True))
+
+
+@pytest.mark.parametrize("name", ["augmented_ekf_imm", "augmented_ekf_mode_probabilities"])
+def test_gaps_do_not_raise_the_rate_of_false_alarms(plant, name):
+    """The label is the most probable one, so one sample is enough: within what the rate without gaps predicts."""
+    patterns = [5, 20, "nothing at sample 0", "q every seventh"]
+    without, *alarms = false_alarms(plant, name, 32, patterns).tolist()
+    assert max(alarms) <= betabinom.ppf(0.99, 32, without + 1, 32 - without + 1), (without, alarms)
+    assert without < 10
+
+
+def sensors_missing(obs, kind):
+    """Without the sensors, the rest is there: 40 samples, or at random."""
+    obs, rng = obs.copy(), np.random.default_rng(9)
+    if kind == "all":
+        for k in (150, 450, 1050):
+            obs[:, k : k + 40, :3] = np.nan
+    elif kind in ("alpha", "q"):
+        for k in (150, 450, 1050):
+            obs[:, k : k + 40, 0 if kind == "alpha" else 1] = np.nan
+    else:
+        obs[:, 1:, :3][rng.random(obs[:, 1:, :3].shape) < 0.2] = np.nan
+    return obs
+
+
+@pytest.mark.parametrize("kind", ["all", "alpha", "q", "random"])
+def test_thresholds_bound_the_residual_through_gaps_at_the_corners_of_the_uncertainty_box(quiet, kind):
+    """Where there is no noise the bound is the model error's alone; the gaps' part of it is not slack only."""
+    corners = [(1,) * 6, (-1,) * 6, (1, -1, 1, -1, 1, -1), (-1, 1, 1, 1, -1, -1), (1, 1, -1, -1, -1, 1)]
+    healthy = missile.study(steps=1300).without_faults()
+    scenarios = [healthy.replace(physical={"rho": [0.05 * s for s in signs]}) for signs in corners]
+    obs = sensors_missing(simulate(quiet, scenarios).obs, kind)
+    rows = [d for d, _ in trace(quiet, obs, np.zeros(2), (1, 2))]
+    ratio = np.max([np.abs(d.eps) / d.threshold for d in rows])
+    assert not rows[-1].alarm.any()
+    assert ratio > 0.5
+
+
+@pytest.mark.parametrize("kind", ["all", "alpha", "q", "random"])
+def test_the_spread_bounds_what_the_prediction_is_off(plant, kind):
+    scenarios, noise = flights(range(6), faults=False)
+    record = simulate(plant, scenarios, noise)
+    obs = sensors_missing(record.obs, kind)[:, :800]
+    for k, state in enumerate(states(detection.approximation_detector(plant), obs)):
+        e = state.filter.estimator
+        assert (np.abs(record.state[:, k, :2] - e.a) <= e.spread).all()
+
+
+@pytest.mark.parametrize("kind", ["all", "random"])
+def test_the_true_class_is_never_excluded_through_gaps(plant, kind):
+    scenarios, noise = flights(range(24))
+    record = simulate(plant, scenarios, noise)
+    bank = trace(plant, sensors_missing(record.obs, kind), np.array(missile.SIGMA[:2]), FIVE)[-1][1]
+    label = record.label[:, -1]
+    faulty = np.flatnonzero(label)
+    assert bank.excluded.any()
+    assert not bank.excluded[faulty, label[faulty] - 1].any()
+    assert (bank.started <= (label > 0)).all()
+
+
+def test_detector_learns_and_tests_nothing_where_a_sensor_is_missing(plant):
+    scenarios, noise = flights([1])
+    obs = simulate(plant, scenarios, noise).obs[:, 1500:]  # a leak begins at 41
+    without = [s.filter for s in states(detection.approximation_detector(plant), obs)]
+    learns = np.diff([d.W[0] for d in without], axis=0).any(axis=1)
+    k = np.flatnonzero(learns)[learns.sum() // 2]  # the weights change from sample k to the next
+    obs[:, k + 1, 0] = np.nan
+    holed = [s.filter for s in states(detection.approximation_detector(plant), obs)]
+    assert np.array_equal(holed[k].W, without[k].W)
+    assert np.array_equal(holed[k + 1].W, holed[k].W)
+    assert not np.array_equal(holed[-1].W, holed[k].W)
+    assert holed[k + 1].eps[0, 0] == 0.0
+    assert holed[k + 1].eps[0, 1] == pytest.approx(without[k + 1].eps[0, 1], rel=0.05)
+    assert (holed[k + 1].threshold >= without[k + 1].threshold).all()
 
 
 @pytest.mark.parametrize("name", NAMES)
