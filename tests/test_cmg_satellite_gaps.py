@@ -113,8 +113,8 @@ def test_multiplicative_update_is_the_textbooks_with_the_missing_rows_removed():
         x, P = np.concatenate([np.zeros(3), ahead.w[i], ahead.f[i]]), ahead.P[i]
         nu = y[i, :6] - np.concatenate([ahead.q[i, :3], ahead.w[i]])
         found = rows_removed(x, P, nu, P @ H[i].T, H[i] @ P @ H[i].T + R[:6, :6], seen[i, :6])
-        turned = np.concatenate([ahead.q[i, :3] + 0.5 * (ahead.q[i, 3] * found[0][:3] + np.cross(ahead.q[i, :3], found[0][:3])),
-                                 [ahead.q[i, 3] - 0.5 * ahead.q[i, :3] @ found[0][:3]]])  # fmt: skip
+        v, q4, t = ahead.q[i, :3], ahead.q[i, 3], found[0][:3]
+        turned = np.array([*(v + 0.5 * (q4 * t + np.cross(v, t))), q4 - 0.5 * v @ t])
         np.testing.assert_allclose(after.q[i], turned / np.linalg.norm(turned), atol=1e-12)
         mine = np.concatenate([found[0][:3], after.w[i], after.f[i]])
         near((mine, after.P[i]), found, P)
@@ -193,7 +193,9 @@ def check_gaps(name, count, steps):
     error = np.abs(found.estimate[:, late] - theta).reshape(len(gaps), -1).mean(axis=1)
     right = (found.label[:, late] == label).reshape(len(gaps), -1).mean(axis=1)
     for i, pattern in enumerate(gaps):
-        assert alarms[i] <= alarms[0], f"{pattern}: {alarms[i]:.0%} of the healthy flights have an alarm, {alarms[0]:.0%} without"
+        assert alarms[i] <= alarms[0], (
+            f"{pattern}: {alarms[i]:.0%} of the healthy flights have an alarm, {alarms[0]:.0%} without"
+        )
         assert right[i] >= right[0] - 0.05, f"{pattern}: {right[i]:.0%} of the labels are right, {right[0]:.0%} without"
         if "always" not in pattern:  # an angle that nobody measures costs what it tells
             assert error[i] <= 1.3 * error[0] + 0.01, f"{pattern}: error {error[i]:.4f}, {error[0]:.4f} without"

@@ -50,7 +50,9 @@ def test_the_nearest_is_found_whatever_is_reported(plant):
     other = turned(plant, y, True, 1)
     assert nearest(plant, other, seen, unknown) is other, "nothing is expected: it is as reported"
     some = seen & (np.arange(y.shape[1]) % 3 != 0)
-    np.testing.assert_allclose(np.where(some, nearest(plant, other, some, expected), 0.0), np.where(some, y, 0.0), atol=1e-12)
+    np.testing.assert_allclose(
+        np.where(some, nearest(plant, other, some, expected), 0.0), np.where(some, y, 0.0), atol=1e-12
+    )
 
 
 def test_a_sign_that_nobody_reports_is_told_from_the_vector_and_noise_turns_nothing():
@@ -63,6 +65,16 @@ def test_a_sign_that_nobody_reports_is_told_from_the_vector_and_noise_turns_noth
     y[:, 10], seen[:, 10] = 0.0, False
     found = nearest(plant, y, seen, expected)
     np.testing.assert_array_equal(found[:, :3], [y[0, :3], -y[1, :3], y[2, :3], y[3, :3]])
+
+
+def test_a_prior_that_says_little_leaves_the_choice_to_the_sign():
+    """Attitudes 130 degrees and more from what is expected, reported in either hemisphere."""
+    plant = load_plant("CMGSatellite")
+    expected = np.array([[-0.7, 0.0, 0.1, *[0.0] * 7, 1.0]])
+    y = np.array([[0.8, 0.1, 0.0, *[0.0] * 7, 1.0]])
+    seen = np.ones((1, 11), bool)
+    np.testing.assert_array_equal(nearest(plant, y, seen, expected), y)
+    np.testing.assert_array_equal(nearest(plant, turned(plant, y), seen, expected), y)
 
 
 # -- every filter that there is

@@ -6,8 +6,8 @@ from conftest import build
 from scipy.stats import multivariate_normal
 
 from baselines.filters.adaptive_ukf import adaptive_filter, every_subset
+from baselines.filters.covariance_adaptive_ukf import covariance_adaptive_ukf
 from baselines.filters.joint_ukf import joint_ukf
-from baselines.filters.sgaukf import sgaukf
 from baselines.filters.two_stage_kf import step as two_stage_kf_step
 from baselines.reproduction.consistency import measure, verdict
 from fdi_gym.diagnosis import make_diagnoser, run
@@ -234,7 +234,7 @@ def test_general_forms_agree_with_the_satellites_own():
     a = filter.start(2)
     for k in range(3000):
         a = filter.step(a, record.obs[:, k])
-    theirs = run(sgaukf(plant), record.obs).estimate[:, -1]
+    theirs = run(covariance_adaptive_ukf(plant), record.obs).estimate[:, -1]
     assert np.abs(1.0 + a.filter.X[:, model.z] - record.theta[:, -1]).max() < 0.05
     assert np.abs(1.0 + a.filter.X[:, model.z] - theirs).max() < 0.06
 

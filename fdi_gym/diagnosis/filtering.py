@@ -52,9 +52,7 @@ class Running(NamedTuple):
 def _start(plant: Plant, filter: Filter, rule: Rule, n: int) -> Running:
     known = np.tile([s.nominal for s in plant.known], (n, 1)) if plant.known else np.zeros((n, 0))
     begun = np.full(n, filter.begin is None)
-    return Running(
-        np.zeros(n, np.int64), begun, np.tile(plant.trim_command, (n, 1)), known, filter.start(n), rule.start(n)
-    )
+    return Running(np.zeros(n, np.int64), begun, np.tile(plant.trim_command, (n, 1)), known, filter.start(n), rule.start(n))
 
 
 def _step(plant: Plant, filter: Filter, rule: Rule, s: Running, obs: Array) -> tuple[Running, Reading, Verdict]:
