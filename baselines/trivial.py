@@ -21,7 +21,7 @@ def null(plant: Plant) -> Diagnoser:
         probs[:, 0] = 1.0
         return state, Diagnosis(np.zeros(n, bool), np.zeros(n, np.int64), np.tile(theta, (n, 1)), None, probs)
 
-    return Diagnoser(lambda n: (), update)
+    return Diagnoser(lambda n: (), update, gaps=True)
 
 
 @diagnoser("random", "A guess, uniform over the labels, at every sample")

@@ -20,8 +20,8 @@ import numpy as np
 import tyro
 
 from baselines.filters.augmented_ekf_bank import augmented_ekf_bank
+from baselines.filters.missile_ekf import Q_THETA, SIGMA_RHO, SIGMA_THETA, THETA_MAX, THETA_MIN
 from fdi_gym.diagnosis import make_diagnoser, run
-from fdi_gym.estimation.missile_ekf import Q_THETA, SIGMA_RHO, SIGMA_THETA, THETA_MAX, THETA_MIN
 from fdi_gym.plants import missile_pitch as m
 from fdi_gym.simulation import simulate
 
@@ -119,12 +119,12 @@ def main(arguments: Arguments) -> None:
     record, flying = timed(simulate, plant, scenarios, noise)
 
     def batched(obs):
-        bank = augmented_ekf_bank(plant)
         state = bank.init(len(obs))
         for k in range(obs.shape[1]):
-            state, _ = bank.update(state, obs[:, k])
-        return state[1].llr
+            state, said = bank.update(state, obs[:, k])
+        return said.signals["log-likelihood ratios"]
 
+    bank = augmented_ekf_bank(plant)
     plain, slow = timed(lambda: np.array([plain_bank(obs) for obs in record.obs[: arguments.plain]]))
     rows = [("plain NumPy, episode by episode", arguments.plain, slow)]
     for n in dict.fromkeys((1, min(50, arguments.episodes), arguments.episodes)):

@@ -3,14 +3,15 @@
 from pathlib import Path
 from tempfile import mkdtemp
 
-from fdi_gym.evaluation import evaluate, load_suite
+from fdi_gym.evaluation import evaluate
 from fdi_gym.leaderboard import confusion_table, table
+from fdi_gym.suite import load_suite
 
 suite = load_suite("b747-standard").head(20)  # the first 20 of the frozen 400 episodes
 names = ["null", "two_stage_kf", "two_stage_kf_exponential", "known_onset_oracle"]
 
 if __name__ == "__main__":
-    rows, microseconds = evaluate(suite, names, work=Path(mkdtemp()), jobs=1)
-    print(table(list(rows.values()), microseconds))
+    found = evaluate(suite, names, work=Path(mkdtemp()), jobs=1)
+    print(table([f.row for f in found.values()], {name: f.made.microseconds for name, f in found.items()}))
     print()
-    print(confusion_table(rows["two_stage_kf_exponential"], [label.name for label in suite.build().labels]))
+    print(confusion_table(found["two_stage_kf_exponential"].row, [label.name for label in suite.build().labels]))

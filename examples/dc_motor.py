@@ -10,16 +10,21 @@ declaration below. Importing this file registers `DCMotor-Faults-v0`, so that `g
 
 import tempfile
 from pathlib import Path
+from typing import Annotated
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 import fdi_gym
 from fdi_gym.diagnosis import diagnosers
-from fdi_gym.evaluation import Suite, applicable, evaluate
+from fdi_gym.evaluation import applicable, evaluate
 from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Incipient, Scoring
 from fdi_gym.kernels import kernel
 from fdi_gym.leaderboard import table
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
+from fdi_gym.shapes import Shapes
+from fdi_gym.suite import Suite
 
 ID, VERSION = "DCMotor", 0
 
@@ -54,6 +59,18 @@ def control(t, y, r, q, c, u):
     error = r[0] - y[1]
     c[0] = min(max(c[0] + q[1] * DT * error, -U_MAX), U_MAX)
     u[0] = min(max(q[0] * error + c[0], -U_MAX), U_MAX)
+
+
+class Reference(msgspec.Struct, forbid_unknown_fields=True):
+    levels: Annotated[list[Annotated[float, Meta(ge=-300, le=300)]], Meta(min_length=1)]  # rad/s
+
+
+class Load(msgspec.Struct, forbid_unknown_fields=True):
+    load: Annotated[float, Meta(ge=0, le=0.1)]  # N m
+
+
+class Physical(msgspec.Struct, forbid_unknown_fields=True):
+    R_A: Annotated[float, Meta(ge=0.1, le=10)] = R_A  # ohm
 
 
 def reference(scenario: FaultScenario) -> np.ndarray:
@@ -100,12 +117,9 @@ def physical(changes: dict) -> np.ndarray:
 
 def plant() -> Plant:
     """Build the plant."""
-    processes = [
-        FaultProcess(
-            name="standard", description="one fault in 75 % of the flights", sample=sample, scoring=Scoring(grace=20)
-        ),
-        FaultProcess(name="fault-free", description="none", sample=lambda rng: sample(rng).without_faults()),
-    ]
+    standard = FaultProcess(
+        name="standard", description="one fault in 75 % of the flights", sample=sample, scoring=Scoring(grace=20)
+    )
     return Plant(
         id=ID, version=VERSION, description="DC motor under speed control", dt=DT, substeps=10,
         kernels=Kernels(dynamics, output, control),
@@ -116,9 +130,9 @@ def plant() -> Plant:
         theta=(Signal("effectiveness", "", 0.0, 1.0, 1.0, nominal=1.0), Signal("added_resistance", "ohm", 0.0, 5.0, 1.0),
                Signal("speed_offset", "rad/s", -50.0, 50.0, 10.0)),
         modes=MODES, labels=(Label("none", frozenset()), *(Label(m.name, frozenset({m.name})) for m in MODES)),
-        processes={p.name: p for p in processes}, c0=np.zeros(1), q=np.array([0.2, 2.0]), physical=physical,
+        processes=[standard], c0=np.zeros(1), q=np.array([0.2, 2.0]), physical=physical,
         perturb=lambda rng, level: {"R_A": R_A * float(1 + level * rng.uniform(-1, 1))},
-        reference=reference, disturbance=disturbance,
+        reference=reference, disturbance=disturbance, shapes=Shapes(Reference, Load, Physical),
     )  # fmt: skip
 
 
@@ -127,13 +141,13 @@ ENV = fdi_gym.register_plant(ID, f"{__name__}:plant")
 
 def main() -> None:
     suite = Suite(
-        name="dc-motor", description="a DC motor", env=ENV, plant=ID, options={}, scenario="standard", mismatch=None,
+        name="dc-motor", description="a DC motor", env=ENV, plant=ID, options={}, process="standard", mismatch=None,
         first_seed=1_000_000, episodes=20, settings={},
     ).sealed()  # fmt: skip
     names, _ = applicable(suite, suite.build(), list(diagnosers()))
     with tempfile.TemporaryDirectory() as work:
-        rows, timing = evaluate(suite, names, work=Path(work), jobs=1)
-    print(table(list(rows.values()), timing))
+        found = evaluate(suite, names, work=Path(work), jobs=1)
+    print(table([f.row for f in found.values()], {name: f.made.microseconds for name, f in found.items()}))
 
 
 if __name__ == "__main__":

@@ -27,6 +27,9 @@ def register_plant(plant_id: str, builder: str, version: int = 0) -> str:
         plant_id: The id its `Plant` declares.
         builder: "module:function" of the function that builds it; worker processes import it by that name.
         version: The version its `Plant` declares.
+
+    Raises:
+        ValueError: The id, version or builder cannot be one, or the id is that of a plant of this package.
     """
     add_plant_source(plant_id, PlantSource(builder, version))
     _register_environment(plant_id, version)

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-import importlib
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import msgspec
 import tyro
 
-Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")]
+Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="METHOD")]
+SuiteName = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SUITE")]
+PlantName = Annotated[str, tyro.conf.arg(metavar="PLANT")]
 
 
 def evaluate(
-    suite: tyro.conf.Positional[str],
+    suite: SuiteName,
     diagnosers: Names = ("all",),
     results: Path | None = None,
     work: Path = Path("runs"),
     jobs: int = -1,
     confusion: Literal["best", "all", "none"] = "best",
+    replace: bool = False,
 ) -> None:
     """Run diagnosers on a suite, print the comparison table, and write one row per diagnoser.
 
@@ -30,11 +32,13 @@ def evaluate(
         work: Folder of finished blocks. A killed run goes on from there.
         jobs: Worker processes, -1 for one per core.
         confusion: Whose confusion matrices to print.
+        replace: Rows in the folder that other sources, settings or data have made may go.
     """
-    from fdi_gym import evaluation, leaderboard
+    from fdi_gym import evaluation, leaderboard, row
     from fdi_gym.diagnosis import diagnosers as known
+    from fdi_gym.suite import load_suite
 
-    frozen = evaluation.load_suite(suite)
+    frozen = load_suite(suite)
     plant = frozen.build()
     names = list(known()) if diagnosers == ("all",) else list(dict.fromkeys(diagnosers))
     names, reasons = evaluation.applicable(frozen, plant, names)
@@ -43,31 +47,42 @@ def evaluate(
     if not names:
         raise ValueError(f"none of these diagnosers can run on {frozen.plant}")
     if results is not None:
-        leaderboard.check_writable(results, frozen, names)
-    command = f"fdi-gym evaluate {frozen.name} --diagnosers {' '.join(names)}"
-    rows, timing = evaluation.evaluate(frozen, names, work=work, jobs=jobs, command=command)
-    print(f"\n{frozen.name}: {frozen.description}\n\n{leaderboard.table(list(rows.values()), timing)}")
-    ranked = sorted(rows.values(), key=lambda row: -row.metrics["per_sample"]["balanced_accuracy"])
-    honest = [row for row in ranked if not row.clairvoyant] or ranked
-    for row in {"best": honest[:1], "all": ranked, "none": []}[confusion]:
-        print(f"\n{leaderboard.confusion_table(row, [label.name for label in plant.labels])}")
+        row.check_writable(results, frozen, {name: evaluation.digests_of(frozen, plant, name) for name in names}, replace)
+    command = f"fdi-gym evaluate {suite} --diagnosers {' '.join(names)}"
+    found = evaluation.evaluate(frozen, names, work=work, jobs=jobs, command=command)
+    rows = [f.row for f in found.values()]
+    times = {name: f.made.microseconds for name, f in found.items()}
+    print(f"\n{frozen.name}: {frozen.description}\n\n{leaderboard.table(rows, times)}")
+    ranked = sorted(rows, key=lambda r: -r.metrics["per_sample"]["balanced_accuracy"])
+    honest = [r for r in ranked if not leaderboard.clairvoyant(r)] or ranked
+    for shown in {"best": honest[:1], "all": ranked, "none": []}[confusion]:
+        print(f"\n{leaderboard.confusion_table(shown, [label.name for label in plant.labels])}")
     if results is not None:
-        leaderboard.write_rows(results, frozen, rows, timing)
+        row.write_rows(results, frozen, found)
         print(f"\n{len(rows)} rows in {results / frozen.name}")
 
 
-def verify(rows: tyro.conf.Positional[tuple[Path, ...]], share: float = 0.1) -> None:
-    """Check rows against their own episodes, and run a share of the episodes again.
+def verify(
+    rows: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="ROW")],
+    share: float = 0.1,
+    seed: int | None = None,
+    suite: Annotated[str, tyro.conf.arg(metavar="SUITE")] = "",
+    trust: Names = (),
+) -> None:
+    """Check all that rows say against their episodes and the code that is here, and run a share of the episodes again.
 
     Args:
-        rows: Row files.
-        share: Share of each row's episodes to run again.
+        rows: Row files; their outcomes lie beside them.
+        share: Share of each row's episodes to run again, above 0 and up to 1.
+        seed: Draws which ones; without it nobody can know beforehand.
+        suite: Name of a suite, or path of a suite file. Default: the one that the row names.
+        trust: Diagnosers "module:function" that may be imported. Look at their code first.
     """
-    from fdi_gym import leaderboard
+    from fdi_gym.verification import verify as check
 
     for path in rows:
-        count = leaderboard.verify(path, share)
-        print(f"{path}: every figure follows from the episodes; {count} run again, same outcomes")
+        episodes = check(path, share, seed=seed, suite=suite, trust=trust)
+        print(f"{path}: every figure follows from the episodes; {len(episodes)} run again, same outcomes: {episodes}")
 
 
 def render(results: Path = Path("leaderboards/results"), page: Path = Path("leaderboards/README.md")) -> None:
@@ -78,77 +93,69 @@ def render(results: Path = Path("leaderboards/results"), page: Path = Path("lead
         page: The page to write.
     """
     from fdi_gym import leaderboard
-    from fdi_gym.evaluation import write_whole
+    from fdi_gym.files import write_whole
 
     write_whole(page, leaderboard.render(results).encode())
     print(page)
 
 
-def show(plant: tyro.conf.Positional[str] = "") -> None:
-    """Say what there is: plants, suites and diagnosers; or, for one plant, its signals, faults and labels.
+def show(name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")] = "") -> None:
+    """Say what there is; or all about one plant, environment, suite, diagnoser or trainer.
 
     Args:
-        plant: Plant id for its data sheet.
+        name: Whose details to print; "module:id" for a plant or diagnoser of your own.
     """
-    from fdi_gym.diagnosis import diagnosers
-    from fdi_gym.evaluation import load_suite, suite_names
-    from fdi_gym.plant import load_plant, plant_sources
+    from fdi_gym import listing
 
-    if plant:
-        print(load_plant(plant).describe())
-        return
-    print("Environments")
-    for name, source in plant_sources().items():
-        print(f"  {name}-Faults-v{source.version}")
-    print("\nSuites")
-    for name in suite_names():
-        print(f"  {name:24s} {load_suite(name).description}")
-    print("\nDiagnosers")
-    for name, entry in diagnosers().items():
-        print(f"  {name:32s} {entry.summary}")
+    print(listing.details(name) if name else listing.overview())
 
 
 def freeze(
-    name: tyro.conf.Positional[str],
-    plant: str,
-    scenario: str,
-    description: str,
+    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")],
+    plant: PlantName,
+    process: Annotated[str, tyro.conf.arg(metavar="PROCESS")],
+    description: Annotated[str, tyro.conf.arg(metavar="TEXT")],
     episodes: int,
     first_seed: int = 1_000_000,
-    options: dict[str, str] = {},  # noqa: B006 (tyro reads the default)
+    options: Annotated[dict[str, str], tyro.conf.arg(metavar="OPTION VALUE")] = {},  # noqa: B006 (tyro reads the default)
     mismatch: float | None = None,
-    settings: str = "{}",
+    settings: Annotated[str, tyro.conf.arg(metavar="JSON")] = "{}",
     folder: Path | None = None,
 ) -> None:
     """Freeze a new suite: write its file with the digest of its scenarios.
 
     Args:
         name: Name of the suite.
-        plant: Plant id.
-        scenario: Fault process.
+        plant: Plant or environment id; "module:id" where the module registers it.
+        process: Fault process.
         description: One line for the table.
         episodes: How many.
         first_seed: First public seed.
-        options: Options of the plant.
-        mismatch: Level of mismatch; without it what the process prescribes.
-        settings: Tuning that belongs to the suite, as JSON: {"diagnoser": {"keyword": value}}.
+        options: Options of the plant, as name and value in turn.
+        mismatch: Level of mismatch, from 0 to 1; without it what the process prescribes.
+        settings: Tuning that belongs to the suite: {"diagnoser": {"keyword": value}}.
         folder: Where the file goes; default: beside the other suites.
     """
-    from fdi_gym import evaluation
+    from fdi_gym.files import decode
+    from fdi_gym.listing import find_plant
     from fdi_gym.plant import load_plant
+    from fdi_gym.suite import SUITES, Suite, checked_options
+    from fdi_gym.suite import freeze as write
 
-    built = load_plant(plant, **options)
-    suite = evaluation.Suite(
-        name=name, description=description, env=built.env_id, plant=plant, options=dict(built.options),
-        scenario=scenario,
-        mismatch=mismatch, first_seed=first_seed, episodes=episodes, settings=msgspec.json.decode(settings),
+    module, plant_id = find_plant(plant)
+    built = load_plant(plant_id, **checked_options(plant_id, options, typed=False))
+    tuning = decode(settings, dict[str, dict[str, Any]], "--settings is not JSON of settings by diagnoser")
+    suite = Suite(
+        name=name, description=description, env=f"{module}:{built.env_id}" if module else built.env_id, plant=plant_id,
+        options=dict(built.options), process=process, mismatch=mismatch, first_seed=first_seed, episodes=episodes,
+        settings=tuning,
     )  # fmt: skip
-    print(evaluation.freeze(suite, folder or evaluation.SUITES))
+    print(write(suite, folder or SUITES))
 
 
 def train(
-    method: tyro.conf.Positional[str],
-    plant: tyro.conf.Positional[str],
+    method: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="METHOD")],
+    plant: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PLANT")],
     budget: int | None = None,
     seed: int = 0,
     work: Path = Path("runs"),
@@ -166,31 +173,45 @@ def train(
         threads: Of torch.
         output: Folder that gets a copy of weights and card.
     """
-    import shutil
+    from fdi_gym.files import write_whole
+    from fdi_gym.listing import find_plant
+    from fdi_gym.training import train as run
 
-    from fdi_gym.training import find_trainer
-
-    module, _, plant_id = plant.rpartition(":")
-    if module:
-        importlib.import_module(module)
-    path = find_trainer(method).train(plant_id.split("-Faults-v")[0], budget=budget, seed=seed, work=work, threads=threads)
+    path = run(method, find_plant(plant)[1], budget=budget, seed=seed, work=work, threads=threads)
     for suffix in (".safetensors", ".json"):
         if output is not None:
             output.mkdir(parents=True, exist_ok=True)
-            shutil.copy(path.with_suffix(suffix), output / f"{path.stem}{suffix}")
+            write_whole(output / f"{path.stem}{suffix}", path.with_suffix(suffix).read_bytes())
     print(path if output is None else output / path.name)
+
+
+COMMANDS: dict[str, Any] = {
+    "evaluate": evaluate, "verify": verify, "leaderboard": render, "list": show, "freeze": freeze, "train": train,
+}  # fmt: skip
 
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point of `fdi-gym`. Errors that a user can mend are one line on stderr, exit status 2."""
-    commands: dict[str, Any] = {
-        "evaluate": evaluate, "verify": verify, "leaderboard": render, "list": show, "freeze": freeze,
-        "train": train,
-    }  # fmt: skip
+    argv = sys.argv[1:] if argv is None else argv
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # "module:function" in the current folder, behind all that is installed
     try:
-        tyro.extras.subcommand_cli_from_dict(commands, prog="fdi-gym", args=argv)
+        if argv == ["--version"]:
+            from fdi_gym import __version__
+
+            print(f"fdi-gym {__version__}")
+        else:
+            tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="fdi-gym", args=argv)
+        sys.stdout.flush()
+    except BrokenPipeError:  # whoever read our output has seen enough
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (until the process ends)
+        raise SystemExit(141) from None
+    except KeyboardInterrupt:
+        print("\nfdi-gym: interrupted; the same command goes on from what is finished", file=sys.stderr)
+        raise SystemExit(130) from None
     except (ValueError, OSError) as error:
-        print(f"fdi-gym: {error}", file=sys.stderr)
+        about = "".join(f"{note}: " for note in getattr(error, "__notes__", []))
+        print(f"fdi-gym: {about}{' '.join(str(error).split())}", file=sys.stderr)
         raise SystemExit(2) from None
 
 

@@ -7,15 +7,32 @@ moves the entries of theta that its effects name; outside it they are nominal. T
 
 from __future__ import annotations
 
+import itertools
+import math
+import re
+import reprlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec import Meta
+
+MAX_STEPS = 1_000_000  # samples of a flight: what is recorded of it takes a gigabyte or less
+MAX_JSON = 2**25  # bytes of a scenario as text
+MAX_DEPTH = 16  # of lists and dicts within reference, disturbance and physical
+
+Finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
+Rate = Annotated[float, Meta(gt=0.0, le=1e9)]  # 1/s
+Period = Annotated[float, Meta(ge=1e-9, le=1e12)]  # s
+Duty = Annotated[float, Meta(gt=0.0, le=1.0)]
+Step = Annotated[int, Meta(ge=0, le=MAX_STEPS)]
+Steps = Annotated[int, Meta(ge=1, le=MAX_STEPS)]
+Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 
-class Effect(msgspec.Struct, frozen=True, tag_field="profile"):
+class Effect(msgspec.Struct, frozen=True, tag_field="profile", forbid_unknown_fields=True):
     """What one fault does to one entry of theta. `entry` is the entry's name in the plant's data sheet."""
 
     entry: str
@@ -24,7 +41,7 @@ class Effect(msgspec.Struct, frozen=True, tag_field="profile"):
 class Abrupt(Effect, frozen=True, tag="abrupt"):
     """theta = value from the onset on."""
 
-    value: float
+    value: Finite
 
 
 class Incipient(Effect, frozen=True, tag="incipient"):
@@ -33,78 +50,113 @@ class Incipient(Effect, frozen=True, tag="incipient"):
     `rate` is in 1/s.
     """
 
-    value: float
-    rate: float
+    value: Finite
+    rate: Rate
 
 
 class Intermittent(Effect, frozen=True, tag="intermittent"):
     """theta = value for the first `duty` of every `period` seconds since the onset, nominal for the rest."""
 
-    value: float
-    period: float
-    duty: float = 0.5
+    value: Finite
+    period: Period
+    duty: Duty = 0.5
 
 
 class Square(Effect, frozen=True, tag="square"):
     """theta = value in the even and `other` in the odd half periods since the onset; `period` in seconds."""
 
-    value: float
-    other: float
-    period: float
+    value: Finite
+    other: Finite
+    period: Period
 
 
 class Hold(Effect, frozen=True, tag="hold"):
-    """theta = what the named command was `lag` steps before the onset: an actuator that jams where it stands."""
+    """theta = what the named command was `lag` steps before the onset: an actuator that jams where it stands.
+
+    At most onset + 1, which is the command before the first sample.
+    """
 
     command: str
-    lag: int = 0
+    lag: Step = 0
 
 
 class Samples(Effect, frozen=True, tag="samples"):
     """theta = values[k - onset]; the last value stays if the fault outlasts them."""
 
-    values: list[float]
+    values: Annotated[list[Finite], Meta(min_length=1, max_length=MAX_STEPS)]
 
 
-class Fault(msgspec.Struct, frozen=True):
+class Fault(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One fault: its mode (the discrete class the plant's labels are made of), its kind within it, and its effects.
 
-    `end` is None for a fault that stays to the end of the flight.
+    `end` is None for a fault that stays to the end of the flight; onset and end may lie beyond it.
     """
 
     mode: str
     kind: str
-    onset: int
-    effects: list[Abrupt | Incipient | Intermittent | Square | Hold | Samples]
-    end: int | None = None
+    onset: Step
+    effects: Annotated[list[Abrupt | Incipient | Intermittent | Square | Hold | Samples], Meta(min_length=1)]
+    end: Step | None = None
 
 
-class FaultScenario(msgspec.Struct, frozen=True, kw_only=True):
+class _Fields(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The fields of a scenario, with their types: what msgspec can check."""
+
+    plant: str
+    steps: Steps
+    faults: list[Fault] = []
+    reference: dict[str, Any] = {}
+    disturbance: dict[str, Any] = {}
+    physical: dict[str, Any] = {}
+    x0: list[Finite] | None = None
+    noise_seed: Seed = 0
+
+
+class FaultScenario(_Fields, frozen=True, kw_only=True):
     """One realisation: everything that is drawn for an episode. Survives a JSON round trip as an equal object.
+
+    What it is made of is checked, and copied, when it is made: types, signs, finite numbers, windows in order, one fault
+    at a time for an entry of theta. NumPy's numbers and arrays become Python's. Whether it fits a plant says
+    `Plant.validate`, which every flight asks.
 
     Args:
         plant: Id of the plant it belongs to.
-        steps: Length of the flight in samples (K).
+        steps: Length of the flight in samples (K), 1 to 1,000,000.
         faults: The faults, in any order.
         reference: What the pilot or guidance asks for, in the plant's own terms.
         disturbance: What the world does to the plant, in the plant's own terms (gusts).
         physical: Physical parameters of the truth that differ from the diagnoser's model.
         x0: Initial state, or None for the plant's own.
-        noise_seed: Seed of the sensor and process noise stream.
+        noise_seed: Seed of the sensor and process noise stream, 0 to 2^63 - 1.
+
+    Raises:
+        ValueError: A field has a value that it cannot have; the message names it and what is allowed.
     """
 
-    plant: str
-    steps: int
-    faults: list[Fault] = []
-    reference: dict[str, Any] = {}
-    disturbance: dict[str, Any] = {}
-    physical: dict[str, Any] = {}
-    x0: list[float] | None = None
-    noise_seed: int = 0
+    def __post_init__(self) -> None:
+        for name in ("reference", "disturbance", "physical"):
+            msgspec.structs.force_setattr(self, name, plain(getattr(self, name), name))
+        try:
+            data = msgspec.to_builtins(self, enc_hook=_of_numpy)
+            checked = msgspec.convert(data, _Fields)
+        except msgspec.ValidationError as error:
+            raise ValueError(f"not a FaultScenario: {error}{_value_at(str(error), data)}") from None
+        except RecursionError:
+            raise ValueError("not a FaultScenario: it contains itself") from None
+        for name in ("plant", "steps", "faults", "x0", "noise_seed"):
+            msgspec.structs.force_setattr(self, name, getattr(checked, name))
+        _check_windows(checked.faults)
 
     def to_json(self) -> str:
-        """The scenario as JSON text."""
-        return msgspec.json.encode(self).decode()
+        """The scenario as JSON text.
+
+        Raises:
+            ValueError: It has become one that could not be made, or has more than MAX_JSON bytes.
+        """
+        text = msgspec.json.encode(self.replace())  # checked again: its lists may have been written to
+        if len(text) > MAX_JSON:
+            raise ValueError(f"a scenario has at most {MAX_JSON} bytes as JSON, not {len(text)}")
+        return text.decode()
 
     @staticmethod
     def from_json(text: str | bytes) -> FaultScenario:
@@ -113,10 +165,15 @@ class FaultScenario(msgspec.Struct, frozen=True, kw_only=True):
         Raises:
             ValueError: The text is not a scenario; the message says where.
         """
+        if not isinstance(text, (str, bytes)):
+            raise TypeError(f"a scenario's JSON is text, not {type(text).__name__}")
+        if len(text) > MAX_JSON:
+            raise ValueError(f"not a FaultScenario: it has at most {MAX_JSON} bytes as JSON, not {len(text)}")
         try:
-            return msgspec.json.decode(text, type=FaultScenario)
-        except msgspec.DecodeError as error:
-            raise ValueError(f"not a FaultScenario: {error}") from error
+            found = msgspec.json.decode(text, type=_Fields)
+        except (ValueError, RecursionError) as error:  # of msgspec, or no UTF-8
+            raise ValueError(f"not a FaultScenario: {error}") from None
+        return FaultScenario(**msgspec.structs.asdict(found))
 
     def without_faults(self) -> FaultScenario:
         """The same flight, healthy: faults discarded, everything else kept."""
@@ -125,6 +182,69 @@ class FaultScenario(msgspec.Struct, frozen=True, kw_only=True):
     def replace(self, **changes: Any) -> FaultScenario:
         """A copy with some fields changed."""
         return msgspec.structs.replace(self, **changes)
+
+
+def _of_numpy(value: Any) -> Any:
+    """NumPy's numbers, strings and arrays as Python's."""
+    if isinstance(value, (np.generic, np.ndarray)) and value.dtype.kind in "biufU":
+        return value.tolist()
+    raise TypeError(f"a scenario holds numbers, strings, lists and dicts, not {type(value).__name__}")
+
+
+def plain(value: Any, where: str, depth: int = 0) -> Any:
+    """A copy of what JSON can say: strings, finite numbers, booleans, None, lists and dicts of them; also from NumPy's.
+
+    Raises:
+        ValueError: Anything else; the message says where.
+    """
+    if value is None or type(value) in (str, bool):
+        return value
+    if type(value) is float or (type(value) is int and abs(value) < 2**63):
+        if math.isfinite(value):
+            return value
+    elif isinstance(value, (np.generic, np.ndarray)) and value.dtype.kind in "biufU":
+        return plain(value.tolist(), where, depth)
+    elif depth >= MAX_DEPTH:
+        raise ValueError(f"{where}: lists and dicts within each other {MAX_DEPTH} deep at most are allowed")
+    elif isinstance(value, (list, tuple)):
+        return [plain(v, f"{where}[{i}]", depth + 1) for i, v in enumerate(value)]
+    elif isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
+        return {str(key): plain(v, f"{where}.{key}", depth + 1) for key, v in value.items()}
+    raise ValueError(f"{where}: strings, finite numbers, lists and dicts of them are allowed, not {reprlib.repr(value)}")
+
+
+def _value_at(message: str, data: Any) -> str:
+    """What stands where a message of msgspec points, as an appendix to it."""
+    path = re.search(r"at `\$(\S+)`$", message)
+    try:
+        for name, index in re.findall(r"\.(\w+)|\[(\d+)\]", path[1] if path else ""):
+            data = data[name or int(index)]
+    except (KeyError, IndexError, TypeError):
+        return ""
+    return f", where there is {reprlib.repr(data)}" if path else ""
+
+
+def _check_windows(faults: list[Fault]) -> None:
+    """Each fault begins before it ends, and no two own an entry of theta at once."""
+    owned: dict[str, list[tuple[int, int, int]]] = {}
+    for i, fault in enumerate(faults):
+        end = MAX_STEPS + 1 if fault.end is None else fault.end
+        if end < fault.onset:
+            raise ValueError(f"faults[{i}]: a fault acts on onset <= k < end, not from {fault.onset} to {end}")
+        for effect in fault.effects:
+            if isinstance(effect, Hold) and effect.lag > fault.onset + 1:
+                raise ValueError(
+                    f"faults[{i}]: a hold has a lag of at most onset + 1 = {fault.onset + 1}, there is no earlier command; "
+                    f"not {effect.lag}"
+                )
+            if end > fault.onset:
+                owned.setdefault(effect.entry, []).append((fault.onset, end, i))
+    for entry, windows in owned.items():
+        for (_, end, i), (onset, _, j) in itertools.pairwise(sorted(windows)):
+            if onset < end:
+                raise ValueError(
+                    f"faults[{i}] and faults[{j}] both own the entry {entry!r} at step {onset}; one at a time is allowed"
+                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,8 +264,11 @@ class Scoring:
     DECISIONS: ClassVar[tuple[str, ...]] = ("final", "second_half")
 
     def __post_init__(self) -> None:
-        if self.decision not in self.DECISIONS or self.start < 1 or self.grace < 0:
-            raise ValueError(f"start >= 1, grace >= 0 and decision one of {self.DECISIONS} are allowed, not {self}")
+        whole = all(isinstance(v, (int, np.integer)) and not isinstance(v, bool) for v in (self.start, self.grace))
+        if self.decision not in self.DECISIONS or not whole or self.start < 1 or self.grace < 0:
+            raise ValueError(
+                f"whole numbers start >= 1, grace >= 0 and decision one of {self.DECISIONS} are allowed, not {self}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,6 +288,19 @@ class FaultProcess:
     sample: Callable[[np.random.Generator], FaultScenario]
     initial: Callable[[np.random.Generator], Sequence[float]] | None = None
     scoring: Scoring = field(default_factory=Scoring)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name or self.name.lstrip().startswith("{"):
+            raise ValueError(f"a fault process has a name that does not begin with a brace, not {self.name!r}")
+        if not callable(self.sample) or not (self.initial is None or callable(self.initial)):
+            raise TypeError(f"the fault process {self.name!r}: sample and initial are functions of a Generator")
+        if not isinstance(self.scoring, Scoring):
+            raise TypeError(f"the fault process {self.name!r}: scoring is a Scoring, not {type(self.scoring).__name__}")
+
+    def without_faults(self) -> FaultProcess:
+        """The process "fault-free": the same flights without their faults."""
+        description, sample = f"the {self.name} flights without their faults", self.sample
+        return replace(self, name="fault-free", description=description, sample=lambda rng: sample(rng).without_faults())
 
 
 class Streams(NamedTuple):
@@ -195,6 +331,8 @@ def draw(
     """
     stream = streams(seed)
     scenario = process.sample(np.random.default_rng(stream.scenario))
+    if not isinstance(scenario, FaultScenario):
+        raise TypeError(f"the fault process {process.name!r} draws a FaultScenario, not {type(scenario).__name__}")
     changes: dict[str, Any] = {"noise_seed": int(stream.noise.generate_state(1, np.uint64)[0] >> np.uint64(1))}
     if process.initial is not None:
         changes["x0"] = [float(v) for v in process.initial(np.random.default_rng(stream.initial))]
@@ -218,26 +356,19 @@ class ThetaTable(NamedTuple):
 def theta_table(
     scenario: FaultScenario, nominal: np.ndarray, entries: Sequence[str], commands: Sequence[str], dt: float
 ) -> ThetaTable:
-    """What the scenario's faults make of theta, step by step. Where two faults own an entry, the later-listed wins.
-
-    Raises:
-        ValueError: An effect names an entry or a command that the plant does not have, or a fault ends before it begins.
-    """
+    """What the faults of a scenario that its plant has validated make of theta, step by step."""
     steps = scenario.steps
     a = np.tile(np.asarray(nominal, float), (steps + 1, 1))
     b, g = np.zeros_like(a), np.zeros_like(a)
     holds: list[tuple[int, int, int, int, int]] = []
     for fault in scenario.faults:
         end = steps + 1 if fault.end is None else min(fault.end, steps + 1)
-        if fault.onset < 0 or (fault.end is not None and fault.end < fault.onset):
-            raise ValueError(f"a fault acts on 0 <= onset <= k < end, not from {fault.onset} to {fault.end}")
-        window = slice(min(fault.onset, steps + 1), max(end, 0))
+        if end <= fault.onset:
+            continue  # an empty window, or one after the flight
+        window = slice(fault.onset, end)
         since = np.arange(window.start, window.stop) - fault.onset
         for effect in fault.effects:
-            if effect.entry not in entries:
-                raise ValueError(f"no theta entry {effect.entry!r}; {scenario.plant} has {', '.join(entries)}")
-            j = list(entries).index(effect.entry)
-            b[window, j] = g[window, j] = 0.0
+            j = entries.index(effect.entry)
             match effect:
                 case Abrupt(value=value):
                     a[window, j] = value
@@ -252,9 +383,7 @@ def theta_table(
                     half = np.floor(since * dt / (period / 2) + 1e-9)
                     a[window, j] = np.where(half % 2 == 0, value, other)
                 case Hold(command=command, lag=lag):
-                    if command not in commands:
-                        raise ValueError(f"no command {command!r}; {scenario.plant} has {', '.join(commands)}")
-                    holds.append((j, fault.onset, end, list(commands).index(command), lag))
+                    holds.append((j, fault.onset, end, commands.index(command), lag))
                 case Samples(values=values):
                     a[window, j] = np.asarray(values)[np.minimum(since, len(values) - 1)]
     return ThetaTable(a, b, g, np.array(holds, dtype=np.int64).reshape(-1, 5))

@@ -1,143 +1,21 @@
-"""Leaderboards: a folder of rows, checked and rendered. No row is believed that cannot be recomputed."""
+"""The pages of the leaderboards: tables of rows, as Markdown."""
 
 from __future__ import annotations
 
-import math
-import os
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-import msgspec
 import numpy as np
 
-from fdi_gym.evaluation import Row, Suite, diagnose, load_suite, write_whole
-from fdi_gym.metrics import BANDS, summarise
+from fdi_gym.diagnosis import diagnosers
+from fdi_gym.files import RefusedError
+from fdi_gym.metrics import BANDS
+from fdi_gym.row import Row, read_made, read_outcomes, read_row, row_files
+from fdi_gym.suite import load_suite
+from fdi_gym.verification import check_row
 
-
-class RefusedError(ValueError):
-    """A row that does not say what its episodes say; the message names the figure."""
-
-
-def _differences(said: Any, found: Any, path: str = "", tolerance: float = 1e-9) -> Iterator[str]:
-    """Where two nests of figures differ, by name."""
-    if isinstance(said, dict) and isinstance(found, dict):
-        for key in [*said, *(k for k in found if k not in said)]:
-            yield from _differences(
-                said.get(key, "nothing"), found.get(key, "nothing"), f"{path}.{key}" if path else key, tolerance
-            )
-    elif isinstance(said, (list, tuple)) and isinstance(found, (list, tuple)) and len(said) == len(found):
-        for i, (a, b) in enumerate(zip(said, found, strict=True)):
-            yield from _differences(a, b, f"{path}[{i}]", tolerance)
-    elif isinstance(said, float) and isinstance(found, (int, float)):
-        if not math.isclose(said, found, rel_tol=tolerance, abs_tol=1e-12):
-            yield f"{path}: the row says {said!r}, its episodes give {found!r}"
-    elif said != found:
-        yield f"{path}: the row says {said!r}, its episodes give {found!r}"
-
-
-def read_row(path: Path) -> Row:
-    """A row from its file.
-
-    Raises:
-        RefusedError: It is not a row.
-    """
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=Row)
-    except (OSError, msgspec.DecodeError) as error:
-        raise RefusedError(f"{path} is not a row: {error}") from error
-
-
-def check_row(row: Row, suite: Suite) -> None:
-    """Compare a row with its suite, its own outcomes and its digest.
-
-    Raises:
-        RefusedError: Another suite version, or a figure that does not follow from the outcomes; it is named.
-    """
-    if row.suite_sha256 != suite.sha256:
-        raise RefusedError(
-            f"{row.suite}/{row.diagnoser}: made with version {row.suite_sha256[:12]} of the suite; "
-            f"here is {suite.sha256[:12]}"
-        )
-    plant = suite.build()
-    if len(row.outcomes) != suite.episodes:
-        raise RefusedError(f"{row.suite}/{row.diagnoser}: {len(row.outcomes)} episodes, the suite has {suite.episodes}")
-    found = summarise(row.outcomes, len(plant.labels), [s.name for s in plant.estimated], plant.dt)
-    differences = list(_differences(row.metrics, msgspec.json.decode(msgspec.json.encode(found)), "metrics"))
-    if differences:
-        raise RefusedError(f"{row.suite}/{row.diagnoser}: {'; '.join(differences[:5])}")
-    if row.sha256 != row.content_sha256():
-        raise RefusedError(
-            f"{row.suite}/{row.diagnoser}: the figures agree with the outcomes, but the row was edited: "
-            f"its digest is {row.content_sha256()[:12]}, it says {row.sha256[:12]}"
-        )
-
-
-def verify(path: Path, share: float = 0.1) -> int:
-    """Check a row and run a share of its episodes again; returns how many.
-
-    Raises:
-        RefusedError: The row fails `check_row`, or an episode gives another outcome; it is named.
-    """
-    row = read_row(path)
-    suite = load_suite(row.suite)
-    check_row(row, suite)
-    count = min(suite.episodes, max(1, math.ceil(share * suite.episodes)))
-    # which ones follows from the row itself, so that nobody can choose the others to edit
-    rng = np.random.default_rng(int(row.sha256[:16], 16))
-    episodes = sorted(int(i) for i in rng.choice(suite.episodes, count, replace=False))
-    block = diagnose(suite, suite.build(), row.diagnoser, episodes)
-    for i, again in zip(episodes, block.outcomes, strict=True):
-        said, found = (msgspec.json.decode(msgspec.json.encode(o)) for o in (row.outcomes[i], again))
-        differences = list(_differences(said, found, f"outcomes[{i}]", tolerance=1e-6))
-        if differences:
-            raise RefusedError(f"{row.suite}/{row.diagnoser}: {'; '.join(differences[:5])}")
-    return count
-
-
-def check_writable(results: Path, suite: Suite, names: list[str]) -> None:
-    """Make sure, before anything runs, that rows can be written and none of another suite version would be lost.
-
-    Raises:
-        ValueError: The folder cannot be written, or holds such a row.
-    """
-    folder = results / suite.name
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".probe-{os.getpid()}"
-        probe.write_bytes(b"")
-        probe.unlink()
-    except OSError as error:
-        raise ValueError(f"cannot write results to {folder}: {error.strerror or error}") from error
-    for name in names:
-        path = row_path(results, suite.name, name)
-        if path.exists():
-            old = read_row(path)
-            if old.suite_sha256 != suite.sha256:
-                raise ValueError(
-                    f"{path} is from another version of {suite.name} "
-                    f"({old.suite_sha256[:12]}, here is {suite.sha256[:12]}); move it away first"
-                )
-
-
-def row_path(results: Path, suite: str, diagnoser: str) -> Path:
-    """Where a row lies."""
-    return results / suite / f"{diagnoser.replace(':', '.')}.json"
-
-
-def write_rows(results: Path, suite: Suite, rows: dict[str, Row], timing: dict[str, float]) -> None:
-    """Write rows, and their times per sample into timing.json beside them."""
-    (results / suite.name).mkdir(parents=True, exist_ok=True)
-    for name, row in rows.items():
-        write_whole(row_path(results, suite.name, name), msgspec.json.encode(row) + b"\n")
-    path = results / suite.name / "timing.json"
-    before = msgspec.json.decode(path.read_bytes()) if path.exists() else {}
-    merged = {**before, **{name: round(value, 2) for name, value in timing.items()}}
-    write_whole(path, msgspec.json.format(msgspec.json.encode(merged, order="sorted"), indent=2) + b"\n")
-
-
-# ---------------------------------------------------------------------------------------------------------------
-# Tables
+_MARKUP = re.compile(r"([\\`*\[\]|])")
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -147,6 +25,19 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     text = ["| " + " | ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) + " |" for line in lines]
     text.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
     return "\n".join(text)
+
+
+def plain(text: str) -> str:
+    """Text from a row, a suite or somebody's code so that Markdown and HTML show it as it is, on one line."""
+    line = "".join(c if c.isprintable() else " " for c in " ".join(text.split()))
+    line = line.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    return _MARKUP.sub(r"\\\1", line)
+
+
+def clairvoyant(row: Row) -> bool:
+    """Whether the diagnoser of a row knows the truth: what its entry says, never what the row says."""
+    entry = diagnosers().get(row.diagnoser)
+    return entry is not None and entry.clairvoyant
 
 
 def _percent(value: float, interval: list[float] | None = None) -> str:
@@ -175,7 +66,7 @@ def cells(row: Row, microseconds: float | None) -> list[str]:
     m = row.metrics
     bands = [m["accuracy_by_severity"][band]["per_sample"] for band in BANDS]
     during = m["rmse"] and m["rmse"]["during"]
-    name = row.diagnoser + (" (knows the truth)" if row.clairvoyant else "")
+    name = plain(row.diagnoser) + (" (knows the truth)" if clairvoyant(row) else "")
     lost = f" ({m['lost_episodes']} lost)" if m["lost_episodes"] else ""
     return [
         name + lost,
@@ -194,7 +85,7 @@ def cells(row: Row, microseconds: float | None) -> list[str]:
     ]
 
 
-def table(rows: list[Row], timing: dict[str, float]) -> str:
+def table(rows: Sequence[Row], timing: Mapping[str, float]) -> str:
     """The comparison table as Markdown, best per-sample balanced accuracy first."""
     ranked = sorted(rows, key=lambda row: (-row.metrics["per_sample"]["balanced_accuracy"], row.diagnoser))
     return markdown(COLUMNS, [cells(row, timing.get(row.diagnoser)) for row in ranked])
@@ -223,23 +114,36 @@ Check a row with `fdi-gym verify leaderboards/results/<suite>/<row>.json`.
 """
 
 
+def read_rows(folder: Path) -> list[Row]:
+    """The rows in a suite's folder; those that are not rows are refused.
+
+    Raises:
+        RefusedError: One is not a row, or of another suite.
+    """
+    rows = [read_row(path) for path in row_files(folder)] if folder.is_dir() else []
+    for row in rows:
+        if row.suite != folder.name:
+            raise RefusedError(f"{folder} holds a row of {row.diagnoser} on another suite, {row.suite}")
+    return rows
+
+
 def render(results: Path) -> str:
     """The page of all tables.
 
     Raises:
-        RefusedError: A row fails its check; it is named, and no page is made.
+        RefusedError: A row does not agree with its outcomes or its suite; it is named, and no page is made.
     """
     parts = [INTRODUCTION]
-    for folder in sorted(path for path in results.iterdir() if path.is_dir()):
+    for folder in sorted(path for path in results.glob("*") if path.is_dir()):
         suite = load_suite(folder.name)
-        timing = folder / "timing.json"
-        times = msgspec.json.decode(timing.read_bytes()) if timing.exists() else {}
-        rows = [read_row(path) for path in sorted(folder.glob("*.json")) if path != timing]
-        for row in rows:
-            check_row(row, suite)
+        plant = suite.build()
+        rows = read_rows(folder)
+        for path, row in zip(row_files(folder), rows, strict=True):
+            check_row(row, read_outcomes(path, row, plant), suite, plant)
+        times = {name: made.microseconds for name, made in read_made(folder).items()}
         parts.append(
-            f"## {suite.name}\n\n{suite.description}\n\n`{suite.env}`, scenario `{suite.scenario}`, "
+            f"## {suite.name}\n\n{plain(suite.description)}\n\n`{suite.env}`, process `{suite.process}`, "
             f"{suite.episodes} episodes, seeds from {suite.first_seed}, version `{suite.sha256[:12]}`.\n\n"
-            f"{table(rows, times)}\n"
+            f"{table(rows, times) if rows else 'No rows yet.'}\n"
         )
     return "\n".join(parts)

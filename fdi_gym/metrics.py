@@ -8,7 +8,7 @@ outcomes it carries.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -23,7 +23,12 @@ BANDS = ("small", "medium", "large")
 BOOTSTRAP, CONFIDENCE = 1000, 0.95
 
 
-class Onset(msgspec.Struct, frozen=True):
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**40)]
+Label = Annotated[int, msgspec.Meta(ge=0, le=2**15)]
+Declared = Annotated[int, msgspec.Meta(ge=-1, le=2**15)]  # -1: no valid diagnosis
+
+
+class Onset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What became of one fault: a maximal run of samples with the same faulty label.
 
     Delays are in samples from the onset step to the sample whose diagnosis shows it; None where it never did before the
@@ -31,29 +36,63 @@ class Onset(msgspec.Struct, frozen=True):
     was already on. `length` is how long the fault was there.
     """
 
-    label: int
-    length: int
+    label: Label
+    length: Count
     fresh: bool
-    detection: int | None
-    isolation: int | None
+    detection: Count | None
+    isolation: Count | None
 
 
-class Outcome(msgspec.Struct, frozen=True):
+class Outcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One episode, reduced to counts."""
 
-    steps: int
+    steps: Count
     terminated: bool
     lost: bool  # the diagnoser's estimate left the numbers
-    decision: tuple[int, int]  # true label and declared label of the episode's one decision
-    band: int | None  # severity band of the episode's decision, None where it is healthy
-    confusion: list[tuple[int, int, int]]  # (true label, declared label, scored samples); -1: no valid diagnosis
-    banded: list[tuple[int, int]]  # per band: scored faulty samples, and those with the right label
+    decision: tuple[Label, Declared]  # true label and declared label of the episode's one decision
+    band: Count | None  # severity band of the episode's decision, None where it is healthy
+    confusion: list[tuple[Label, Declared, Count]]  # (true label, declared label, scored samples)
+    banded: list[tuple[Count, Count]]  # per band: scored faulty samples, and those with the right label
     onsets: list[Onset]
-    false_alarms: int  # alarms that rose while the plant was healthy
-    healthy_steps: int
+    false_alarms: Count  # alarms that rose while the plant was healthy
+    healthy_steps: Count
     squared_error: list[list[float]]  # per phase: sum over samples, per estimated entry
-    error_steps: list[int]  # per phase
+    error_steps: list[Count]  # per phase
     log_score: float | None  # sum of log probabilities of the true label over scored samples, where there are any
+
+
+def check_outcomes(outcomes: Sequence[Outcome], labels: int, entries: int) -> None:
+    """Make sure that outcomes from a file can be those of flights of a plant, so that scores can be made of them.
+
+    Args:
+        outcomes: The outcomes; their fields are of the declared types.
+        labels: Number of labels.
+        entries: Number of estimated entries.
+
+    Raises:
+        ValueError: A label that the plant has not, counts that exceed the flight, lists of another length, sums that no
+            error has.
+    """
+    for i, episode in enumerate(outcomes):
+        said = [*episode.decision, *(o.label for o in episode.onsets), *(v for pair in episode.confusion for v in pair[:2])]
+        counted = [sum(c for *_, c in episode.confusion), sum(seen for seen, _ in episode.banded), sum(episode.error_steps),
+                   sum(o.length for o in episode.onsets), episode.healthy_steps, episode.false_alarms]  # fmt: skip
+        sums = [value for phase in episode.squared_error for value in phase]
+        wrong = {
+            "a label that the plant does not have": max(said) >= labels,
+            "counts above the length of the flight": max(counted) > episode.steps,
+            "more right samples than samples": any(right > seen for seen, right in episode.banded),
+            "lists of another length": (len(episode.banded), len(episode.error_steps), len(episode.squared_error))
+            != (len(BANDS), len(PHASES), len(PHASES)) or any(len(phase) != entries for phase in episode.squared_error),
+            "an unknown severity": episode.band is not None and episode.band >= len(BANDS),
+            "a delay beyond its fault": any(d is not None and d > o.length for o in episode.onsets
+                                            for d in (o.detection, o.isolation)),
+            "sums of squares that no error has": any(not 0 <= value < 1e300 for value in sums),
+            "a log score above 0": episode.log_score is not None and not -1e300 < episode.log_score <= 1e-6,
+        }  # fmt: skip
+        for what, is_so in wrong.items():
+            if is_so:
+                raise ValueError(f"episode {i} has {what}")
 
 
 def scored_samples(label: Array, length: int, scoring: Scoring) -> Array:

@@ -7,20 +7,25 @@ returns a `Plant`. It is discovered; nothing is listed. A plant outside the pack
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import importlib
 import inspect
 import itertools
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+import reprlib
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from fdi_gym.checks import check_declaration, check_scenario, is_whole, twice, unknown
 from fdi_gym.faults import FaultProcess, FaultScenario, ThetaTable, theta_table
+from fdi_gym.shapes import OPEN, Shapes
 
 Array = np.ndarray
 
@@ -69,7 +74,8 @@ class FaultMode(NamedTuple):
         bands: Sizes below the first are "small", below the second "medium", else "large".
         offset, direction, reach: The line that the fault spans in the estimated space, as a deviation from healthy:
             offset + m direction with m in reach. A stuck surface has offset -1 in its effectiveness, direction its
-            position. Two faults add their deviations.
+            position. Two faults add their deviations. A fault that is building up is on its way from healthy to there;
+            processes other than "standard" may draw one that stays short of the reach, none beyond it.
     """
 
     name: str
@@ -99,6 +105,14 @@ class Kernels(NamedTuple):
     outside: Any = None
 
 
+class Inputs(NamedTuple):
+    """What a scenario's dicts make: rows (steps + 1, n_r) and (steps + 1, n_d), parameters (n_p,)."""
+
+    reference: Array
+    disturbance: Array
+    physical: Array
+
+
 def squared_error(scale: Sequence[float]) -> Callable[[Array], Array]:
     """The usual identification reward: minus the sum of squared errors (..., n), each divided by its scale."""
     weight = 1.0 / np.asarray(scale, float) ** 2
@@ -123,9 +137,51 @@ def _no_change(physical: Mapping[str, Any]) -> Array:
     return np.zeros(0)
 
 
-@dataclass(frozen=True, kw_only=True)
+class _Sent:
+    """A kernel under way to another process: by its name where it has one, else by its source; compiled there."""
+
+    def __init__(self, dispatcher: Any):
+        self.dispatcher = dispatcher
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        from fdi_gym import kernels
+
+        function = self.dispatcher.py_func
+        if getattr(sys.modules.get(function.__module__), function.__name__, None) is self.dispatcher:
+            return _arrived, (function.__module__, function.__name__)
+        return kernels.kernel, (function,)
+
+
+def _arrived(module: str, name: str) -> Any:
+    return getattr(importlib.import_module(module), name)
+
+
+class _ByName:
+    """The field `Plant.processes`: given as a sequence or by name, read by name."""
+
+    def __get__(self, plant: Any, owner: type | None = None) -> Mapping[str, FaultProcess]:
+        if plant is None:
+            raise AttributeError("no default")
+        return plant.__dict__["processes"]
+
+    def __set__(self, plant: Any, given: Sequence[FaultProcess] | Mapping[str, FaultProcess]) -> None:
+        found = given
+        if not isinstance(found, Mapping):
+            for wrong in twice("processes", [process.name for process in found]):
+                raise ValueError(f"{plant.id}: {wrong}")
+            found = {process.name: process for process in found}
+        if "standard" in found and "fault-free" not in found:
+            found = {**found, "fault-free": found["standard"].without_faults()}
+        plant.__dict__["processes"] = found
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Plant:
     """A plant's whole declaration. Built by the plant file's `plant(**options)`; plain data, functions and kernels.
+
+    A contradiction in it raises ValueError. A plant that `load_plant` built is pickled as its id and options, equals
+    another of the same, and can be sent to any process that can import its builder; any other plant is pickled by value
+    and equals itself only.
 
     Args:
         id: The part of the environment id before "-Faults-v".
@@ -143,7 +199,8 @@ class Plant:
             quantity (..., n). Default: theta itself.
         modes: The fault modes.
         labels: The answers of the isolation task; the first one is "none".
-        processes: Fault processes by name; must hold "standard".
+        processes: The fault processes, one of them called "standard". Where none is called "fault-free", there is one
+            that draws the standard flights without their faults. Stored by name.
         c0: Initial state of the controller.
         q: Parameters of the controller.
         true_feedback: The controller gets the sensors' values before their noise is added; diagnosers never do.
@@ -154,12 +211,11 @@ class Plant:
         measured_disturbance: What the known signals say of the disturbance that is held over an interval:
             measured_disturbance(t, before, now) -> (n, n_d), from its start t [s] and the known signals (n, n_known) at
             its two ends. None where nothing is known of it.
+        shapes: What the three dicts of a scenario may hold; what does not fit is refused before it flies.
         monitor: Maps states (..., n_x) to named quantities (...) that `info` reports beside the truth, such as the distance
             to a singularity; diagnosers never see them.
         quaternions: Outputs that are a quaternion known up to its sign: the positions of its vector part (3) and of the
             sign of its scalar part, for each.
-        tuning: Settings of diagnosers, by name, that suit this plant better than what they find for themselves, such as
-            those of its paper; what a caller gives overrides them.
         noise: Draws (w (steps, n_x), v (steps + 1, n_y)) from a Generator. Default: white, row by row, v before w.
         isolation_reward: (labels, labels): reward of declaring column while row is true. Default: 1 if right, else 0.
         identification_reward: Reward of an error (..., n). Default: minus the squares, scaled.
@@ -177,7 +233,7 @@ class Plant:
     theta: tuple[Signal, ...]
     modes: tuple[FaultMode, ...]
     labels: tuple[Label, ...]
-    processes: Mapping[str, FaultProcess]
+    processes: _ByName = _ByName()
     options: Mapping[str, Any] = field(default_factory=dict)
     linear: bool = False
     known: tuple[Signal, ...] = ()
@@ -193,27 +249,39 @@ class Plant:
     disturbance: Callable[[FaultScenario], Array] | None = None
     measured_disturbance: Callable[[float, Array, Array], Array] | None = None
     monitor: Callable[[Array], Mapping[str, Array]] = _nothing
+    shapes: Shapes = OPEN
     quaternions: tuple[tuple[int, int, int, int], ...] = ()
-    tuning: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     noise: Callable[[np.random.Generator, int], tuple[Array, Array]] | None = None
     isolation_reward: Array | None = None
     identification_reward: Callable[[Array], Array] | None = None
 
     def __post_init__(self) -> None:
-        names = {mode.name for mode in self.modes}
-        unknown = {name for label in self.labels for name in label.modes} - names
-        if unknown or not self.labels or self.labels[0].modes:
-            raise ValueError(
-                f"labels start with the empty set and use declared modes {sorted(names)}, not {sorted(unknown)}"
-            )
-        if "standard" not in self.processes:
-            raise ValueError(f"a plant needs a 'standard' fault process; {self.id} has {', '.join(self.processes)}")
         if not self.estimated:
             object.__setattr__(self, "estimated", self.theta)
         if self.isolation_reward is None:
             object.__setattr__(self, "isolation_reward", np.eye(len(self.labels)))
+        check_declaration(self)
         if self.identification_reward is None:
             object.__setattr__(self, "identification_reward", squared_error([s.scale for s in self.estimated]))
+
+    @property
+    def origin(self) -> Origin | None:
+        """How `load_plant` built it; None for a plant made otherwise."""
+        return self.__dict__.get("_origin")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self.origin is not None:
+            return _rebuilt, tuple(self.origin)
+        state = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        state["kernels"] = Kernels(*(f if f is None else _Sent(f) for f in self.kernels))
+        return object.__new__, (Plant,), state
+
+    def __eq__(self, other: object) -> bool:
+        same = isinstance(other, Plant) and self.origin is not None and self.origin == other.origin
+        return self is other or same
+
+    def __hash__(self) -> int:
+        return object.__hash__(self) if self.origin is None else hash((self.origin.plant_id, self.origin.source))
 
     # -- derived facts, computed from the declaration and nothing else
 
@@ -261,34 +329,89 @@ class Plant:
         """What the identification task asks for, from theta (..., n_theta) and the command held with it (..., n_u)."""
         return theta if self.target is None else self.target(theta, u)
 
+    @functools.cached_property
+    def theta_entries(self) -> tuple[str, ...]:
+        """Names of the entries of theta, in order."""
+        return tuple(s.name for s in self.theta)
+
+    @functools.cached_property
+    def command_names(self) -> tuple[str, ...]:
+        """Names of the commands, in order."""
+        return tuple(s.name for s in self.commands)
+
+    @functools.cached_property
+    def _label_index(self) -> dict[frozenset[str], int]:
+        return {frozenset(label.modes): index for index, label in enumerate(self.labels)}
+
     def label_of(self, modes: frozenset[str]) -> int:
         """Index of the label whose modes these are.
 
         Raises:
             ValueError: No label says so; the message lists those that exist.
         """
-        for index, label in enumerate(self.labels):
-            if label.modes == modes:
-                return index
-        raise ValueError(
-            f"{self.id} has no label for {sorted(modes)}; it has {', '.join(label.name for label in self.labels)}"
-        )
+        index = self._label_index.get(modes)
+        if index is None:
+            names = ", ".join(label.name for label in self.labels)
+            raise ValueError(f"{self.id} has no label for {sorted(modes)} at once; it has {names}")
+        return index
+
+    def label_intervals(self, scenario: FaultScenario) -> Iterator[tuple[int, int, frozenset[str]]]:
+        """The flight's intervals (first step, end step, active modes) between the changes of the set of active modes."""
+        ends = [scenario.steps if f.end is None else min(f.end, scenario.steps) for f in scenario.faults]
+        edges = sorted({0, scenario.steps, *(min(f.onset, scenario.steps) for f in scenario.faults), *ends})
+        for start, stop in itertools.pairwise(edges):
+            active = (f.mode for f, end in zip(scenario.faults, ends, strict=True) if f.onset <= start < end)
+            yield start, stop, frozenset(active)
 
     def label_rows(self, scenario: FaultScenario) -> Array:
         """The true label at the samples 0..K: sample k has that of the fault which acted over [k - 1, k)."""
         rows = np.zeros(scenario.steps + 1, dtype=np.int64)
-        ends = [scenario.steps if f.end is None else min(f.end, scenario.steps) for f in scenario.faults]
-        edges = sorted({0, scenario.steps, *(min(f.onset, scenario.steps) for f in scenario.faults), *ends})
-        for start, stop in itertools.pairwise(edges):
-            active = frozenset(f.mode for f, end in zip(scenario.faults, ends, strict=True) if f.onset <= start < end)
+        for start, stop, active in self.label_intervals(scenario):
             rows[start + 1 : stop + 1] = self.label_of(active)
         return rows
 
+    def validate(self, scenario: FaultScenario) -> None:
+        """Whether a scenario fits this plant, whole: every flight asks before a kernel sees it.
+
+        Raises:
+            ValueError: It does not; the message names the field, what was wrong and what is allowed.
+            TypeError: It is no scenario.
+        """
+        check_scenario(self, scenario)
+
+    def inputs(self, scenario: FaultScenario) -> Inputs:
+        """What the scenario's dicts make for the kernels, in the shapes that they take.
+
+        Raises:
+            ValueError: The plant's function refuses the dict, or returns something else than finite rows of that shape.
+        """
+        rows = scenario.steps + 1
+        if self.disturbance is None:
+            d = np.zeros((rows, len(self.disturbances)))
+        else:
+            d = self._made("disturbance", self.disturbance, scenario, (rows, len(self.disturbances)))
+        p = self.nominal_p
+        if scenario.physical:
+            p = self._made("physical", lambda s: self.physical(s.physical), scenario, p.shape)
+        return Inputs(self._made("reference", self.reference, scenario, (rows, None)), d, p)
+
+    def _made(self, name: str, make: Callable[[FaultScenario], Array], scenario: FaultScenario, shape: tuple) -> Array:
+        try:
+            made = contiguous(make(scenario))
+        except Exception as error:  # whatever the plant's author did not think of
+            what = f"{type(error).__name__}: {error}"
+            raise ValueError(f"{name} of a {self.id} scenario, {reprlib.repr(getattr(scenario, name))}: {what}") from error
+        fits = made.ndim == len(shape) and all(n in (m, None) for m, n in zip(made.shape, shape, strict=True))
+        if not fits or not np.isfinite(made).all():
+            raise ValueError(
+                f"{name} of a {self.id} scenario: the plant makes finite numbers in the shape {shape} of it, not those of "
+                f"{reprlib.repr(getattr(scenario, name))} ({made.shape}{', not all finite' if fits else ''})"
+            )
+        return made
+
     def theta_table(self, scenario: FaultScenario) -> ThetaTable:
         """What the scenario makes of theta (see `fdi_gym.faults.theta_table`)."""
-        return theta_table(
-            scenario, self.nominal_theta, [s.name for s in self.theta], [s.name for s in self.commands], self.dt
-        )
+        return theta_table(scenario, self.nominal_theta, self.theta_entries, self.command_names, self.dt)
 
     def process(self, name: str) -> FaultProcess:
         """A fault process by name.
@@ -297,7 +420,7 @@ class Plant:
             ValueError: There is none of that name; the message lists those that exist.
         """
         if name not in self.processes:
-            raise ValueError(f"unknown scenario {name!r}; {self.id} has {', '.join(self.processes)}")
+            raise ValueError(unknown("scenario", name, self.processes, self.id))
         return self.processes[name]
 
     def describe(self) -> str:
@@ -405,11 +528,18 @@ class PlantSource(NamedTuple):
     version: int
 
 
+class Origin(NamedTuple):
+    """What a plant can be built from again, in any process."""
+
+    plant_id: str
+    source: PlantSource
+    options: dict[str, Any]
+
+
 _registered: dict[str, PlantSource] = {}
 
 
-def plant_sources() -> dict[str, PlantSource]:
-    """All plants by id, read from the ID and VERSION lines of the plant files: nothing is imported to list them."""
+def _package_sources() -> dict[str, PlantSource]:
     found = {}
     for path in sorted(_FOLDER.glob("[!_]*.py")):
         text = path.read_text(encoding="utf-8")
@@ -417,11 +547,28 @@ def plant_sources() -> dict[str, PlantSource]:
         version = re.search(r"^VERSION = (\d+)$", text, re.MULTILINE)
         if name and version:
             found[name[1]] = PlantSource(f"fdi_gym.plants.{path.stem}:plant", int(version[1]))
-    return dict(sorted((found | _registered).items()))
+    return found
+
+
+def plant_sources() -> dict[str, PlantSource]:
+    """All plants by id, read from the ID and VERSION lines of the plant files: nothing is imported to list them."""
+    return dict(sorted((_package_sources() | _registered).items()))
 
 
 def add_plant_source(plant_id: str, source: PlantSource) -> None:
-    """Make a plant outside the package known; users call `fdi_gym.register_plant`, which registers its environment too."""
+    """Make a plant outside the package known; users call `fdi_gym.register_plant`, which registers its environment too.
+
+    Raises:
+        ValueError: The id, version or builder cannot be one, or a plant of the package has the id.
+    """
+    if not isinstance(plant_id, str) or not re.fullmatch(r"\w+", plant_id):
+        raise ValueError(f"a plant's id is a word of letters, digits and underscores, not {plant_id!r}")
+    if not is_whole(source.version) or source.version < 0:
+        raise ValueError(f"{plant_id}: version is a whole number from 0 on, not {source.version!r}")
+    if not isinstance(source.builder, str) or not re.fullmatch(r"\w+(\.\w+)*:\w+", source.builder):
+        raise ValueError(f"{plant_id}: the builder is named as 'module:function', not {source.builder!r}")
+    if plant_id in _package_sources():
+        raise ValueError(f"{plant_id} is a plant of this package; another one needs another id")
     _registered[plant_id] = source
 
 
@@ -429,15 +576,43 @@ def load_plant(plant_id: str, **options: Any) -> Plant:
     """Build a plant by id with the options of its data sheet.
 
     Raises:
-        ValueError: Unknown plant or option; the message lists those that exist.
+        ValueError: Unknown plant, option or option value (the message lists those that exist), or a builder that does
+            not build the plant it is registered for.
     """
     sources = plant_sources()
-    if plant_id not in sources:
-        raise ValueError(f"unknown plant {plant_id!r}; there are {', '.join(sources)}")
-    module, function = sources[plant_id].builder.split(":")
-    build = getattr(importlib.import_module(module), function)
-    allowed = inspect.signature(build).parameters
-    for option in options:
-        if option not in allowed:
-            raise ValueError(f"unknown option {option!r}; {plant_id} has {', '.join(allowed) or 'none'}")
-    return build(**options)
+    if not isinstance(plant_id, str) or plant_id not in sources:
+        raise ValueError(unknown("plant", plant_id, sources))
+    return _built(plant_id, sources[plant_id], options)
+
+
+def _rebuilt(plant_id: str, source: PlantSource, options: dict[str, Any]) -> Plant:
+    """A plant from its pickle."""
+    return _built(plant_id, source, options)
+
+
+def _built(plant_id: str, source: PlantSource, options: dict[str, Any]) -> Plant:
+    module, function = source.builder.split(":")
+    try:
+        build = getattr(importlib.import_module(module), function)
+        parameters = inspect.signature(build).parameters
+    except Exception as error:
+        what = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{plant_id}: its builder {source.builder!r} cannot be imported: {what}") from error
+    named = [n for n, p in parameters.items() if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+        for option in options:
+            if option not in named:
+                raise ValueError(unknown("option", option, named, plant_id))
+    try:
+        plant = build(**options)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{plant_id} with the options {options}: {error}") from error
+    except Exception as error:
+        what = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{plant_id}: its builder {source.builder!r} fails with the options {options}: {what}") from error
+    if not isinstance(plant, Plant) or (plant.id, plant.version) != (plant_id, source.version):
+        made = f"the plant {plant.env_id}" if isinstance(plant, Plant) else repr(plant)
+        raise ValueError(f"{source.builder!r} is registered for {plant_id}-Faults-v{source.version}, but returns {made}")
+    defaults = {n: parameters[n].default for n in named}
+    object.__setattr__(plant, "_origin", Origin(plant_id, source, {**defaults, **options}))
+    return plant

@@ -58,6 +58,8 @@ def simulate(plant: Plant, scenarios: Sequence[FaultScenario], noise: Sequence[t
     Raises:
         ValueError: A scenario of another plant, or one that names something this plant does not have.
     """
+    for scenario in scenarios:
+        plant.validate(scenario)
     n, longest = len(scenarios), max(s.steps for s in scenarios)
     widths = (len(plant.observed), len(plant.states), len(plant.theta))
     obs, state, theta = (np.empty((n, longest + 1, width)) for width in widths)
@@ -65,23 +67,21 @@ def simulate(plant: Plant, scenarios: Sequence[FaultScenario], noise: Sequence[t
     length, terminated = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=bool)
     sensor_range = np.array([[s.low for s in plant.outputs], [s.high for s in plant.outputs]], float)
     for i, scenario in enumerate(scenarios):
-        if scenario.plant != plant.id:
-            raise ValueError(f"the scenario belongs to {scenario.plant}, not to {plant.id}")
         steps = scenario.steps
         if noise is not None:
             w, v = noise[i]
         else:
             rng = np.random.default_rng(scenario.noise_seed)
             w, v = plant.noise(rng, steps) if plant.noise else white_noise(plant, rng, steps)
-        d = plant.disturbance(scenario) if plant.disturbance else np.zeros((steps + 1, len(plant.disturbances)))
+        if np.shape(w) != (steps, len(plant.states)) or np.shape(v) != (steps + 1, len(plant.outputs)):
+            raise ValueError(f"noise has the shapes of `no_noise`, not {np.shape(w)} and {np.shape(v)}")
+        r, d, p = plant.inputs(scenario)
         flown = kernels.simulate(
             *plant.addresses, plant.dt, plant.substeps,
             plant.trim_state if scenario.x0 is None else np.array(scenario.x0, float),
             plant.trim_command, contiguous(plant.c0), contiguous(plant.q),
-            contiguous(plant.reference(scenario)), contiguous(d),
-            *plant.theta_table(scenario), contiguous(w), contiguous(v), sensor_range,
-            contiguous(plant.physical(scenario.physical)) if scenario.physical else plant.nominal_p,
-            plant.nominal_theta, int(plant.true_feedback), state[i], obs[i], theta[i],
+            r, d, *plant.theta_table(scenario), contiguous(w), contiguous(v), sensor_range,
+            p, plant.nominal_theta, int(plant.true_feedback), state[i], obs[i], theta[i],
         )  # fmt: skip
         length[i], terminated[i] = abs(flown), flown < 0
         label[i, : steps + 1] = plant.label_rows(scenario)

@@ -7,10 +7,11 @@ import importlib
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from fdi_gym.estimation import calibration, unknown_inputs
-from fdi_gym.estimation.prior import flights_of
+from fdi_gym.diagnosis import filtering, fitting, knowledge
+from fdi_gym.estimation.decision import Rule, Verdict
 from fdi_gym.plant import Plant, load_plant, plant_sources
 from fdi_gym.simulation import simulate
 
@@ -40,14 +41,37 @@ def motor() -> Plant:
 
 @pytest.fixture
 def short_calibrations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Calibrations on four flights of at most 100 samples, kept nowhere: for tests that don't count alarms."""
+    """Fits from four flights of at most 100 samples, none of them shipped or kept: for tests that don't count alarms."""
+    real = fitting.flights_of
 
     def short(plant, process, first, count, faults):
-        scenarios, _ = flights_of(plant, process, first, min(count, 4), faults)
-        scenarios = [s.replace(steps=min(s.steps, 100)) for s in scenarios]
-        return scenarios, simulate(plant, scenarios)
+        scenarios, record = real(plant, process, first, min(count, 4), faults)
+        if first == fitting.FIRST:
+            scenarios = [s.replace(steps=min(s.steps, 100)) for s in scenarios]
+            record = simulate(plant, scenarios)
+        return scenarios, record
 
-    monkeypatch.setattr(calibration, "flights_of", short)
-    monkeypatch.setattr(unknown_inputs, "flights_of", short)
-    monkeypatch.setattr(calibration, "_kept", {})
-    monkeypatch.setattr(calibration, "cache_folder", lambda source: None)
+    monkeypatch.setattr(fitting, "flights_of", short)
+    monkeypatch.setattr(fitting, "FLIGHTS", 4)
+    monkeypatch.setattr(fitting, "CHANNEL_FLIGHTS", 4)
+    monkeypatch.setattr(knowledge, "_kept", {})
+    monkeypatch.setattr(knowledge, "fits_file", lambda folder, plant_id: None)
+    monkeypatch.setattr(knowledge, "cache_folder", lambda source: None)
+
+
+SILENT = Rule(lambda n: np.zeros(n), lambda s, k, r, informed: (s, Verdict(s > 0, s.astype(int))))
+
+
+def states(plant, filter, obs, begun=None):
+    """The state of a filter after each sample of observations (N, K, n_obs); `begun`: a state to start from."""
+    s = filtering._start(plant, filter, SILENT, len(obs))
+    if begun is not None:
+        s = s._replace(filter=begun)
+    for k in range(obs.shape[1]):
+        s, *_ = filtering._step(plant, filter, SILENT, s, obs[:, k])
+        yield s.filter
+
+
+def readings(plant, filter, obs):
+    """What a filter reads after each sample."""
+    return (filter.read(s) for s in states(plant, filter, obs))

@@ -123,7 +123,7 @@ def test_doublet_and_prbs():
     assert e[100, 1] == 1.2
     assert e[120, 1] == -1.2
     with pytest.raises(ValueError, match="multisine, doublet, prbs"):
-        b747.excitation({"command": "chirp"}, 10)
+        build("B747Lateral").validate(b747.paper().replace(reference={"command": "chirp"}))
 
 
 def test_bank_reference_starts_with_one_step_of_its_lag(b747):

@@ -2,15 +2,17 @@
 
 import numpy as np
 import pytest
-from conftest import build
+from conftest import build, readings, states
 from scipy.integrate import quad
 from scipy.stats import chi2
 
-from baselines.filters import augmented_kf, friedland_kf, two_stage_kf
-from baselines.filters.bayes_bank import log_mean_exp, sense
-from baselines.filters.windowed_nis import steady_filter
+from baselines.filters import augmented_kf, friedland_kf, kalman_filter, two_stage_kf
+from baselines.filters.bayes_bank import log_mean_exp
+from baselines.filters.windowed_nis import chi_square_quantile
 from fdi_gym.diagnosis import Diagnosis, NotApplicableError, make_diagnoser, run
-from fdi_gym.estimation.decision import closest, distance_logic, fit, manifolds, penalty_logic, persistence_logic
+from fdi_gym.estimation.calibration import Persistence, uniform
+from fdi_gym.estimation.decision import Reading, by_candidate, by_labels
+from fdi_gym.estimation.labels import closest, distances, manifolds
 from fdi_gym.estimation.linear import linear_model
 from fdi_gym.faults import draw
 from fdi_gym.plants import b747_lateral as b747
@@ -23,9 +25,11 @@ Y = np.array([[0.05, -0.02, -0.03, 0.10], [0.00, 0.01, -0.06, -0.05], [-0.04, -0
 
 def five_steps(rule):
     plant = build("B747Lateral")
-    model, s, found = linear_model(plant), two_stage_kf.start(1, 4, *two_stage_kf.prior(plant)), []
+    model, found = linear_model(plant), []
+    s = two_stage_kf.start(1, 4, *two_stage_kf.initial_covariances(plant))
     for u, y in zip(U, Y, strict=True):
-        s = two_stage_kf.step(s, u[None], y[None], model, plant.Q, plant.R, two_stage_kf.forget(s.Pz, rule, 0.99, 1e-4, 1.0))
+        s = two_stage_kf.predict(s, u[None], model, plant.Q, two_stage_kf.forget(s.Pz, rule, 0.99, 1e-4, 1.0))
+        s = two_stage_kf.correct(s, y[None], np.ones((1, 4), bool), model.C, plant.R)
         found.append((s, float(s.nu[0] @ np.linalg.solve(s.S[0], s.nu[0]))))
     return found
 
@@ -81,14 +85,14 @@ def test_forgetting_check_values(rule):
     assert s.z[0] == pytest.approx(z, rel=1e-9)
     assert np.diag(s.Pz[0]) == pytest.approx(pz, rel=1e-9)
     assert nis == pytest.approx(expected, rel=1e-9)
-    fits = fit(s.z, s.Pz, manifolds(build("B747Lateral")))
+    fits = distances(s.z, s.Pz, manifolds(build("B747Lateral")))
     assert [fits.J_healthy[0], *fits.J[0]] == pytest.approx(J, rel=1e-9)
 
 
 def test_distance_check_values():
     s, _ = five_steps("none")[-1]
     groups = manifolds(build("B747Lateral"))
-    fits = fit(s.z, s.Pz, groups)
+    fits = distances(s.z, s.Pz, groups)
     J = [0.14805861615922056, 0.13644295833777953, 1.3327735526295577, 0.2151953406131838, 2.346543363041098]
     assert [fits.J_healthy[0], *fits.J[0]] == pytest.approx(J, rel=1e-9)
     _, m = closest(s.z, np.linalg.inv(s.Pz), groups[0])
@@ -99,42 +103,66 @@ RULES = {"constant": (0.0, "none"), "random walk": (1e-4, "none"), "exponential"
          "directional": (0.0, "directional")}  # fmt: skip
 
 
+def long_flight():
+    """4,000 samples with the rudder stuck in the middle."""
+    plant = build("B747Lateral")
+    scenario = b747.paper().replace(steps=4000, faults=[b747.stuck("rudder", 2.0, 1000, 3000)], noise_seed=3)
+    return plant, simulate(plant, [scenario]).obs
+
+
+def farthest(plant, one, other, obs, *names):
+    """The largest difference of two filters' readings."""
+    pairs = zip(readings(plant, one, obs), readings(plant, other, obs), strict=True)
+    return max(np.abs(getattr(a, name) - getattr(b, name)).max() for a, b in pairs for name in names)
+
+
 @pytest.mark.parametrize("rule", list(RULES))
 def test_two_stage_equals_augmented(rule):
     """The two-stage filter is the augmented one, whatever happens to the fault parameter's covariance."""
-    plant = build("B747Lateral")
-    q_bias, forgetting = RULES[rule]
-    scenario = b747.paper().replace(steps=4000, faults=[b747.stuck("rudder", 2.0, 1000, 3000)], noise_seed=3)
-    obs = simulate(plant, [scenario]).obs
-    model, Qz = linear_model(plant), q_bias * np.eye(4)
-    a = two_stage_kf.start(1, 4, *two_stage_kf.prior(plant))
-    b = augmented_kf.start(1, 4, *two_stage_kf.prior(plant))
-    worst = 0.0
-    for k in range(1, 4001):
-        y, u, _ = plant.split(obs[:, k])
-        a, b = (
-            module.step(s, u, y, model, plant.Q, plant.R, two_stage_kf.forget(s.Pz, forgetting, 0.99, 1e-4, 1.0) + Qz)
-            for module, s in ((two_stage_kf, a), (augmented_kf, b))
-        )
-        worst = max(worst, np.abs(a.state() - b.X[:, :4]).max(), np.abs(a.z - b.z).max(),
-                    np.abs(a.covariance() - b.P[:, :4, :4]).max(), np.abs(a.nu - b.nu).max())  # fmt: skip
-    assert worst < 1e-9
+    plant, obs = long_flight()
+    aged = two_stage_kf.aging(plant, *RULES[rule], 0.99, 1e-4, 1.0)
+    two, one = two_stage_kf.two_stage_filter(plant, aged), augmented_kf.augmented_filter(plant, aged)
+    assert farthest(plant, two, one, obs, "z", "P", "x", "Px", "nu", "S") < 1e-9
+
+
+@pytest.mark.parametrize("rule", list(RULES))
+def test_missing_sensors_are_rows_removed(rule):
+    """Any pattern: the two-stage filter is the augmented textbook filter without the rows of what is missing."""
+    plant, obs = long_flight()
+    obs = obs[:, :400].copy()
+    gone = np.random.default_rng(2).random(obs[:, 1:, :4].shape) < 0.4
+    gone[:, 100:120] = True
+    obs[:, 1:, :4] = np.where(gone, np.nan, obs[:, 1:, :4])
+    aged = two_stage_kf.aging(plant, *RULES[rule], 0.99, 1e-4, 1.0)
+    found = list(readings(plant, two_stage_kf.two_stage_filter(plant, aged), obs))
+    model, (P_x, P_z) = linear_model(plant), two_stage_kf.initial_covariances(plant)
+    X, P = np.zeros(8), np.zeros((8, 8))
+    P[:4, :4], P[4:, 4:] = P_x, P_z
+    for k in range(1, 400):
+        u, F = obs[0, k, 4:], np.eye(8)
+        F[:4, :4], F[:4, 4:] = model.A, model.E(u[None])[0]
+        X = F @ X
+        X[:4] += model.B @ u
+        older = aged(P[None, 4:, 4:])[0] - P[4:, 4:]
+        P = F @ P @ F.T
+        P[:4, :4] += plant.Q
+        P[4:, 4:] += older
+        rows = np.flatnonzero(~gone[0, k - 1])
+        H = np.eye(4, 8)[rows]
+        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + plant.R[np.ix_(rows, rows)])
+        X, P = X + K @ (obs[0, k, rows] - H @ X), P - K @ H @ P
+        assert found[k].z[0] == pytest.approx(X[4:], abs=1e-9)
+        assert found[k].P[0] == pytest.approx(P[4:, 4:], abs=1e-9)
+        assert found[k].x[0] == pytest.approx(X[:4], abs=1e-9)
+        assert found[k].seen[0] == len(rows)
 
 
 @pytest.mark.parametrize(("q_bias", "equal"), [(0.0, True), (1e-4, False)])
 def test_friedland_equals_augmented_only_for_a_constant_bias(q_bias, equal):
-    plant = build("B747Lateral")
-    scenario = b747.paper().replace(steps=4000, faults=[b747.stuck("rudder", 2.0, 1000, 3000)], noise_seed=3)
-    obs = simulate(plant, [scenario]).obs
-    model, Qz = linear_model(plant), q_bias * np.eye(4)
-    a = two_stage_kf.start(1, 4, *two_stage_kf.prior(plant))
-    b = augmented_kf.start(1, 4, *two_stage_kf.prior(plant))
-    worst = 0.0
-    for k in range(1, 4001):
-        y, u, _ = plant.split(obs[:, k])
-        a = friedland_kf.step(a, u, y, model, plant.Q, plant.R, Qz)
-        b = augmented_kf.step(b, u, y, model, plant.Q, plant.R, b.Pz + Qz)
-        worst = max(worst, np.abs(a.z - b.z).max())
+    plant, obs = long_flight()
+    bare = friedland_kf.friedland_kf(plant, q_bias=q_bias).filter
+    one = augmented_kf.augmented_filter(plant, two_stage_kf.aging(plant, q_bias, "none", 0.99, 1e-4, 1.0))
+    worst = farthest(plant, bare, one, obs, "z")
     assert worst < 1e-9 if equal else worst > 1e-3
 
 
@@ -144,18 +172,16 @@ def test_filter_is_consistent_on_fault_free_flights():
     n, steps = 100, 300
     scenarios = [draw(plant.process("fault-free"), 40_000 + s) for s in range(n)]
     record = simulate(plant, scenarios)
-    model, rng = linear_model(plant), np.random.default_rng(5)
-    P_x, P_z = two_stage_kf.prior(plant)
-    s = two_stage_kf.start(n, 4, P_x, P_z)
+    rng, filter = np.random.default_rng(5), two_stage_kf.two_stage_filter(plant, lambda Pz: Pz)
+    P_x, _ = two_stage_kf.initial_covariances(plant)
     # the flights start at 0 and healthy: draw the prior's errors into the filter instead
-    s = s._replace(x=rng.standard_normal((n, 4)) * np.sqrt(np.diag(P_x)), z=np.zeros((n, 4)))
+    begun = filter.start(n)._replace(x=rng.standard_normal((n, 4)) * np.sqrt(np.diag(P_x)))
     nees, nis = np.zeros((2, steps))
-    for k in range(1, steps + 1):
-        y, u, _ = plant.split(record.obs[:, k])
-        s = two_stage_kf.step(s, u, y, model, plant.Q, plant.R, s.Pz)
-        error = record.state[:, k] - s.state()
-        nees[k - 1] = np.einsum("ni,nij,nj->n", error, np.linalg.inv(s.covariance()), error).mean()
-        nis[k - 1] = np.einsum("ni,nij,nj->n", s.nu, np.linalg.inv(s.S), s.nu).mean()
+    for k, s in enumerate(states(plant, filter, record.obs[:, : steps + 1], begun)):
+        if k:
+            error = record.state[:, k] - s.state()
+            nees[k - 1] = np.einsum("ni,nij,nj->n", error, np.linalg.inv(s.covariance()), error).mean()
+            nis[k - 1] = np.einsum("ni,nij,nj->n", s.nu, np.linalg.inv(s.S), s.nu).mean()
     low, high = chi2.ppf([0.0005, 0.9995], 4 * n) / n
     # the bias is exactly its prior mean, so the filter is cautious: never too confident
     assert (nees <= high).mean() > 0.98
@@ -166,11 +192,11 @@ def test_filter_is_consistent_on_fault_free_flights():
 
 @pytest.mark.parametrize(("N", "c", "limit"), [(1, 0.9999, 23.512742), (50, 0.9999, 283.060254), (50, 0.999, 267.540528)])
 def test_nis_limits(N, c, limit):
-    assert chi2.ppf(c, 4 * N) == pytest.approx(limit, abs=6e-7)
+    assert chi_square_quantile(c, 4 * N) == pytest.approx(limit, abs=6e-7)
 
 
 def test_steady_filter_check_values():
-    nominal = steady_filter(build("B747Lateral"))
+    nominal = kalman_filter.nominal_filter(build("B747Lateral"))
     P = nominal.S - build("B747Lateral").R
     assert P == pytest.approx(np.array([
         [1.7698942267e-03, -5.3020223794e-04, 2.8731840058e-04, -3.6189367338e-05],
@@ -182,18 +208,19 @@ def test_steady_filter_check_values():
         [-0.0242389611, 0.4483050951, -0.0237062083, 0.0112915733],
         [0.0162059158, -0.0237062083, 0.2919956686, -0.0030857921],
         [-0.0005873053, 0.0451662934, -0.0123431685, 0.0492729359]]), abs=6e-10)  # fmt: skip
-    bare = steady_filter(build("B747Lateral", variant="bare/closed"))
+    bare = kalman_filter.nominal_filter(build("B747Lateral", variant="bare/closed"))
     assert np.diag(bare.K) == pytest.approx([0.15396028034, 0.45105422188, 0.32223761013, 0.050909927922], abs=6e-11)
 
 
 def test_information_matrix():
     plant = build("B747Lateral")
-    nominal = steady_filter(plant)
+    nominal = kalman_filter.nominal_filter(plant)
     e = b747.excitation({"command": "multisine", "scale": 1.0, "phases": b747.PAPER_PHASES}, 700)
     M, G, g = np.zeros((1, 1, 4, 4)), np.zeros((1, 1, 4, 4)), np.zeros((1, 1, 4))
     bounds = {}
     for k in range(600):
-        M, G, g = sense(M, G, g, nominal.model.E(e[k : k + 1])[:, None], np.zeros((1, 4)), nominal)
+        still = kalman_filter.start(nominal, plant, 1)
+        M, G, g = kalman_filter.sense(nominal, still, M, G, g, nominal.model.E(e[k : k + 1])[:, None])
         if k + 1 in (100, 200, 600):
             bounds[k + 1] = np.sqrt(np.diag(np.linalg.inv(G[0, 0])))
         if k + 1 == 100:
@@ -253,12 +280,12 @@ def test_boxed_least_squares_with_two_faults():
         assert (m[0, h] <= pairs.high[h] + 1e-9).all()
 
 
-def play(logic, z, P):
-    """Labels of a logic over a sequence of estimates, sample 1 on."""
-    state, said = logic.start(1), []
+def play(rule, z, P):
+    """Labels of a rule over a sequence of estimates, sample 1 on."""
+    state, said = rule.start(1), []
     for k, row in enumerate(z, start=1):
-        state, decision = logic.step(state, k, np.array([row]), P[None])
-        said.append(int(decision.label[0]))
+        state, verdict = rule.step(state, np.array([k]), Reading(np.array([row]), P[None]), np.ones(1, bool))
+        said.append(int(verdict.label[0]))
     return said
 
 
@@ -266,9 +293,10 @@ HEALTHY, STUCK, LOSS = [0.0] * 4, [0, -1, 0, 2], [0, -0.6, 0, 0]
 P = np.diag([0.01, 0.01, 0.01, 0.01])
 
 
-def test_distance_logic_counts():
-    logic = distance_logic(build("B747Lateral"), warmup=3, alarm_after=5, switch_after=10, release_after=50)
-    said = play(logic, [STUCK] * 20 + [LOSS] * 30 + [HEALTHY] * 60, P)
+def test_distance_counts():
+    plant = build("B747Lateral")
+    rule = by_labels(plant, uniform(plant, 8.0, Persistence(5, 10, 50, warmup=3)))
+    said = play(rule, [STUCK] * 20 + [LOSS] * 30 + [HEALTHY] * 60, P)
     # samples 1..3 silent; counting starts at 4, so the 5th exceedance is at sample 8
     assert said[:7] == [0] * 7
     assert said[7:20] == [4] * 13
@@ -281,22 +309,37 @@ def test_distance_logic_counts():
     assert said[99:] == [0] * 11
 
 
-def test_persistence_logic_counts():
-    logic = persistence_logic(build("B747Lateral"), lambda z: (np.abs(z[:, 1]) > 0.5).astype(int), after=20, warmup=10)
-    said = play(logic, [LOSS] * 40 + [HEALTHY] * 30, P)
+def test_candidate_counts():
+    rule = by_candidate(lambda r, label: (np.abs(r.z[:, 1]) > 0.5).astype(int), after=20, warmup=10)
+    said = play(rule, [LOSS] * 40 + [HEALTHY] * 30, P)
     assert said[:29] == [0] * 29
     assert said[29:59] == [1] * 30
     assert said[59:] == [0] * 11
 
 
-def test_penalty_logic_prefers_fewer_faults():
+def test_a_penalty_per_fault_prefers_fewer_faults():
     plant = build("B747Lateral", labels="dual")
-    logic = penalty_logic(plant, warmup=0)
+    rule = by_labels(plant, uniform(plant, 8.0, Persistence(10, 10, 10, warmup=0, same=True)))
     single = [0, -0.6, 0, 0.05]
     both = [-0.6, -1, 0, 1.5]
-    assert play(logic, [single] * 15, P)[-1] == plant.label_of(frozenset({"rudder LOE"}))
-    assert play(logic, [both] * 15, P)[-1] == plant.label_of(frozenset({"aileron LOE", "rudder stuck"}))
-    assert play(logic, [both] * 15, P)[:9] == [0] * 9
+    assert play(rule, [single] * 15, P)[-1] == plant.label_of(frozenset({"rudder LOE"}))
+    assert play(rule, [both] * 15, P)[-1] == plant.label_of(frozenset({"aileron LOE", "rudder stuck"}))
+    assert play(rule, [both] * 15, P)[:9] == [0] * 9
+
+
+def test_a_flight_longer_than_the_banks_horizon_is_still_diagnosed():
+    """Faults that begin after the last flight of the process would have ended are found as the others are."""
+    plant = build("B747Lateral")
+    drawn = [draw(plant.process("standard"), 70_000 + s) for s in range(40)]
+    late = [
+        s.replace(steps=2400, faults=[type(f)(f.mode, f.kind, f.onset + 1100, f.effects) for f in s.faults])
+        for s in drawn if s.faults
+    ][:12]  # fmt: skip
+    record = simulate(plant, late)
+    said = run(make_diagnoser("bayes_bank", plant), record.obs)
+    faulty = record.label > 0
+    assert (said.label == record.label)[faulty].mean() > 0.7
+    assert (said.label == 0)[~faulty].mean() > 0.9
 
 
 def test_linear_filters_refuse_a_nonlinear_plant(motor):

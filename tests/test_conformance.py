@@ -9,7 +9,7 @@ from conftest import PLANTS, build
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-from fdi_gym.diagnosis import NotApplicableError, diagnosers
+from fdi_gym.diagnosis import NotApplicableError, diagnosers, make_diagnoser
 from fdi_gym.envs import FDIEnv
 from fdi_gym.faults import draw
 from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env
@@ -58,8 +58,7 @@ def test_diagnoser(short_calibrations, plant_id, name):
     entry = diagnosers()[name]
 
     def make(plant, scenarios):
-        known = {"scenarios": scenarios} if entry.clairvoyant else {}
-        return entry.build(plant, **entry.settings_on(plant), **known)
+        return make_diagnoser(name, plant, scenarios=scenarios if entry.clairvoyant else None)
 
     try:
         make(build(plant_id), [draw(build(plant_id).processes["standard"], 0)])

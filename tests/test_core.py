@@ -87,15 +87,6 @@ def test_profiles():
     assert table([Hold("offset", "right", lag=1)], end=8).holds.tolist() == [[1, 3, 8, 1, 1]]
 
 
-def test_profiles_name_what_is_wrong():
-    with pytest.raises(ValueError, match="gain, offset"):
-        table([Abrupt("slope", 1.0)])
-    with pytest.raises(ValueError, match="left, right"):
-        table([Hold("offset", "middle")])
-    with pytest.raises(ValueError, match="not from 5 to 2"):
-        table([Abrupt("gain", 1.0)], onset=5, end=2)
-
-
 def test_zero_size_fault_is_healthy(b747):
     healthy = draw(b747.process("fault-free"), 4)
     nothing = healthy.replace(faults=[Fault("aileron LOE", "LOE", 300, [Abrupt("gamma_aileron", 0.0)])])

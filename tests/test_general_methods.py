@@ -2,19 +2,24 @@
 
 import numpy as np
 import pytest
-from conftest import build
+from conftest import build, readings, states
 from scipy.stats import multivariate_normal
+from test_general_filters import belief_of, interval, model_of
 
-from baselines.filters.adaptive_ukf import adaptive_filter, every_subset
-from baselines.filters.covariance_adaptive_ukf import covariance_adaptive_ukf
+from baselines.filters import glr_signatures as glr
+from baselines.filters import multiple_model
+from baselines.filters.adaptive_ukf import WALK, adaptive_filter, every_subset
+from baselines.filters.augmented_gaussian import gaussian_filter
 from baselines.filters.joint_ukf import joint_ukf
-from baselines.filters.two_stage_kf import step as two_stage_kf_step
+from baselines.filters.two_stage_ekf import two_stage_filter
+from baselines.filters.two_stage_kf import aging
+from baselines.filters.two_stage_kf import two_stage_filter as papers_two_stage
 from baselines.reproduction.consistency import measure, verdict
 from fdi_gym.diagnosis import make_diagnoser, run
-from fdi_gym.estimation import gaussian, glr, multiple_model, two_stage
-from fdi_gym.estimation.augmented import augmented
+from fdi_gym.diagnosis.fitting import flights_of
+from fdi_gym.estimation import mixing
+from fdi_gym.estimation.gaussian import jacobian
 from fdi_gym.estimation.linear import linear_model
-from fdi_gym.estimation.prior import flights_of
 from fdi_gym.faults import draw
 from fdi_gym.simulation import no_noise, simulate
 
@@ -27,47 +32,34 @@ def faulty(plant):
     return flights_of(plant, "standard", 400_000, FLIGHTS, True)[1]
 
 
-def samples(record, first=0, last=150):
-    return range(first, min(last, int(record.length.min())))
-
-
 def test_two_stage_is_the_augmented_extended_filter(plant, faulty):
-    """Mean and covariance of state, fault and disturbance, while both run through a fault-free and a faulty stretch."""
-    model = augmented(plant)
-    a, b = gaussian.start(model, FLIGHTS), two_stage.start(model, FLIGHTS)
-    rest = two_stage.others(model)
-    for k in samples(faulty):
-        obs = faulty.obs[:, k + 300] if faulty.obs.shape[1] > 500 else faulty.obs[:, k]
-        a, b = gaussian.advance(model, gaussian.extended, a, obs), two_stage.advance(model, b, obs)
-    scale = model.scale
-    assert np.abs((a.X[:, model.z] - b.z) / scale[model.z]).max() < 1e-6
-    assert np.abs((a.X[:, rest] - b.state()) / scale[rest]).max() < 1e-6
-    for mine, theirs, s in (
-        (a.P[:, model.z, model.z], b.Pz, scale[model.z]),
-        (a.P[:, rest][:, :, rest], b.covariance(), scale[rest]),
-        (a.S, b.S, np.sqrt(np.diag(model.R))),
-    ):
+    """Mean and covariance of state, fault and innovation, through a fault-free and a faulty stretch and through gaps."""
+    model = model_of(plant)
+    first = 300 if faulty.obs.shape[1] > 500 else 0
+    obs = faulty.obs[:, first : first + 150].copy()
+    gone = np.random.default_rng(0).random(obs[:, :, : len(plant.outputs)].shape) < 0.2
+    gone[:, 60:70] = True
+    obs[:, :, : len(plant.outputs)] = np.where(gone, np.nan, obs[:, :, : len(plant.outputs)])
+    *_, a = readings(plant, gaussian_filter(model, "extended"), obs)
+    *_, b = readings(plant, two_stage_filter(model), obs)
+    scale, rest = model.scale, model.x
+    assert np.abs((a.z - b.z) / scale[model.z]).max() < 1e-6
+    assert np.abs((a.x - b.x) / scale[rest]).max() < 1e-6
+    for mine, theirs, s in ((a.P, b.P, scale[model.z]), (a.Px, b.Px, scale[rest]), (a.S, b.S, np.sqrt(np.diag(model.R)))):
         assert np.abs((mine - theirs) / np.outer(s, s)).max() < 1e-6
-    assert np.abs(a.nu - b.nu).max() < 1e-6 * np.abs(a.nu).max()
+    assert np.abs(a.nu - b.nu).max() < 1e-6 * max(np.abs(a.nu).max(), 1e-9)
 
 
 def test_two_stage_equals_the_papers_on_the_linear_plant(b747):
     """Same prior and random walk: the Keller-Darouach recursion of the 747 to rounding."""
-    from baselines.filters.two_stage_kf import start
-
     record = flights_of(b747, "standard", 400_000, FLIGHTS, True)[1]
-    model = augmented(b747, x0_std=[0.1] * 4, z0_std=[1, 1, 2, 2], z_walk=[1e-3] * 4)
-    general = two_stage.start(model, FLIGHTS)
-    own = start(FLIGHTS, 4, 0.01 * np.eye(4), np.diag([1.0, 1.0, 4.0, 4.0]))
-    linear = linear_model(b747)
-    for k in range(400):
-        general = two_stage.advance(model, general, record.obs[:, k], first_sample=False)
-        if k > 0:
-            y, u, _ = b747.split(record.obs[:, k])
-            own = two_stage_kf_step(own, u, y, linear, b747.Q, b747.R, own.Pz + 1e-6 * np.eye(4))
-    assert np.abs(general.z - own.z).max() < 1e-9
-    assert np.abs(general.Pz - own.Pz).max() < 1e-9
-    assert np.abs(general.state() - own.state()).max() < 1e-9
+    model = model_of(b747, x0_std=[0.1] * 4, z0_std=[1, 1, 2, 2], z_walk=[1e-3] * 4)
+    model = model._replace(limit=np.full(8, np.inf))
+    own = papers_two_stage(b747, aging(b747, 1e-6, "none", 0.99, 1e-4, 1.0))
+    obs = record.obs[:, :400]
+    for a, b in zip(readings(b747, two_stage_filter(model, first_sample=False), obs), readings(b747, own, obs), strict=True):
+        for name in ("z", "P", "x"):
+            assert np.abs(getattr(a, name) - getattr(b, name)).max() < 1e-9
 
 
 # -- interacting models
@@ -75,54 +67,54 @@ def test_two_stage_equals_the_papers_on_the_linear_plant(b747):
 
 def test_mixing_keeps_the_mixture(plant):
     """Mean and second moment of state and disturbance, over all models, are those from before the mixing."""
-    bank = multiple_model.bank(plant)
+    models = multiple_model.hypotheses(plant, belief_of(plant))
     record = flights_of(plant, "standard", 400_000, FLIGHTS, True)[1]
-    s = multiple_model.start(bank, FLIGHTS)
-    for k in range(30):
-        s = multiple_model.advance(bank, s, record.obs[:, k])
+    *_, s = states(plant, multiple_model.bank(models), record.obs[:, :30])
     rng = np.random.default_rng(1)
     mu = rng.dirichlet(np.ones(s.mu.shape[1]), FLIGHTS)
-    s = s._replace(mu=mu, X=s.X + rng.standard_normal(s.X.shape) * bank.model.scale)
-    c, X, P = multiple_model.mix(bank, s)
+    X0 = s.X + rng.standard_normal(s.X.shape) * models.model.scale
+    c, w = mixing.ahead(mu, models.transition)
+    X, P = mixing.mix(w, X0, s.P, models.model.z, models.m0, models.M0)
     assert np.allclose(c.sum(axis=1), 1.0)
-    keep = two_stage.others(bank.model)
+    keep = models.model.rest
 
     def moments(weight, x, p):
         x, p = x[..., keep], p[..., keep, :][..., keep]
         return (weight[..., None] * x).sum(1), (weight[..., None, None] * (p + x[..., :, None] * x[..., None, :])).sum(1)
 
-    for before, after in zip(moments(mu, s.X, s.P), moments(c, X, P), strict=True):
+    for before, after in zip(moments(mu, X0, s.P), moments(c, X, P), strict=True):
         assert np.allclose(before, after, rtol=1e-9, atol=1e-12)
-    assert np.linalg.eigvalsh(P / np.outer(bank.model.scale, bank.model.scale)).min() > -1e-9
+    assert np.linalg.eigvalsh(P / np.outer(models.model.scale, models.model.scale)).min() > -1e-9
 
 
 def test_bank_without_changes_is_bayes_over_single_filters(b747):
     """With no exchange between the models, the probabilities are those of independent filters' likelihoods."""
-    bank = multiple_model.bank(b747)
+    models = multiple_model.hypotheses(b747, belief_of(b747))
     labels = len(b747.labels)
-    alone = bank._replace(transition=np.eye(labels))
+    alone = models._replace(transition=np.eye(labels))
     record = flights_of(b747, "standard", 400_000, 1, True)[1]
-    s = multiple_model.start(alone, 1)._replace(mu=np.full((1, labels), 1 / labels))
-    linear, offset, direction = linear_model(b747), *bank.model.lines
+    bank = multiple_model.bank(alone)
+    even = np.full((1, labels), 1 / labels)
+    *_, s = states(b747, bank, record.obs[:, :60], bank.start(1)._replace(mu=even, c=even))
+    linear, (offset, direction) = linear_model(b747), models.model.lines
     filters = [(np.zeros(5), None) for _ in range(labels)]
     log = np.zeros(labels)
     for k in range(60):
-        s = multiple_model.advance(alone, s, record.obs[:, k])
         y, u, _ = b747.split(record.obs[:, k])
         for j in range(labels):
             x, P = filters[j]
             if P is None:
-                x = np.concatenate([bank.model.X0[:4], bank.m0[j]])
+                x = np.concatenate([models.model.X0[:4], models.m0[j]])
                 P = np.zeros((5, 5))
-                P[:4, :4], P[4:, 4:] = bank.model.P0[:4, :4], bank.M0[j]
+                P[:4, :4], P[4:, 4:] = models.model.P0[:4, :4], models.M0[j]
             else:
                 E = linear.E(u)[0]
                 F = np.eye(5)
                 F[:4, :4], F[:4, 4] = linear.A, E @ direction[j][:, 0]
                 x = F @ x + np.concatenate([linear.B @ u[0] + E @ offset[j], [0.0]])
-                P = F @ P @ F.T + bank.model.Q[j]
+                P = F @ P @ F.T + models.model.Q[j]
             H = np.hstack([linear.C, np.zeros((4, 1))])
-            S = H @ P @ H.T + bank.model.R
+            S = H @ P @ H.T + models.model.R
             log[j] += multivariate_normal.logpdf(y[0], H @ x, S)
             K = P @ H.T @ np.linalg.inv(S)
             filters[j] = (x + K @ (y[0] - H @ x), P - K @ H @ P)
@@ -139,16 +131,14 @@ def test_bank_without_changes_is_bayes_over_single_filters(b747):
 def test_signature_predicts_the_innovations_of_a_fault(b747):
     """Noise-free, from one of the tried onsets on: the innovations less the healthy ones are signature x fault."""
     spacing, onset = 20, 199  # a slot that opens at sample 200 stands for a fault over [199, 200) and later
-    model = augmented(b747)
-    test = glr.Test(model, *glr.secants(b747, model.prior.z_size), onsets=8, spacing=spacing)
+    filter = glr.glr_filter(b747, model_of(b747), belief_of(b747).z_size, 8, spacing)
     drawn = (draw(b747.process("standard"), 2_400_000 + i) for i in range(99))
     scenario = next(s for s in drawn if s.faults and s.faults[0].kind == "LOE")
     fault = scenario.faults[0]
     scenario = scenario.replace(faults=[type(fault)(fault.mode, fault.kind, onset, fault.effects)])
     record = simulate(b747, [scenario, scenario.without_faults()], [no_noise(b747, scenario.steps)] * 2)
-    s, truth = glr.start(test, 2), record.theta[0, -1]
-    for k in range(onset + 60):
-        s = glr.advance(test, s, record.obs[:, k])
+    *_, s = states(b747, filter, record.obs[:, : onset + 60])
+    truth = record.theta[0, -1]
     slot = (onset + 60 - 1) // spacing - (onset + 1) // spacing
     moved = s.g[0] - s.g[1]
     assert np.abs(moved[slot] - s.G[0, slot] @ truth).max() < 1e-9 * np.abs(moved[slot]).max()
@@ -165,14 +155,16 @@ def test_secants_lie_on_the_side_of_the_modes():
 
 
 def test_linearisation_equals_the_jacobian_where_the_model_is_linear_in_the_fault(b747):
-    model = augmented(b747)
+    model, obs = model_of(b747), np.zeros((2, 6))
     X = np.random.default_rng(3).standard_normal((2, 4))
-    u = np.array([[1.0, -2.0], [0.5, 0.3]])
-    from fdi_gym.estimation.augmented import Interval
+    obs[:, 4:] = [[1.0, -2.0], [0.5, 0.3]]
+    at = interval(b747, obs, obs, 5)
 
-    at = Interval(5, np.zeros((2, 4)), u, None)
-    found = glr.linearised(model, "f", X, at, *glr.secants(b747, model.prior.z_size))
-    _, F = model.jacobian("f", np.concatenate([X, np.zeros((2, 4))], axis=1), at)
+    def f(points):
+        return model.f(points, at)
+
+    found = glr.linearised(model, f, X, *glr.secants(b747, belief_of(b747).z_size), model.rest)
+    _, F = jacobian(f, np.concatenate([X, np.zeros((2, 4))], axis=1), model.step)
     assert np.allclose(found.A, F[:, :4, :4], atol=1e-9)
     assert np.allclose(found.E, F[:, :4, 4:], atol=1e-9)
 
@@ -187,12 +179,10 @@ def test_subsets():
 
 @pytest.mark.parametrize("grid", ["full", "simplified", "elements"])
 def test_without_a_flag_it_is_the_augmented_ukf(plant, grid):
-    model, filter = adaptive_filter(plant, grid)
-    record = flights_of(plant, "standard", 400_000, FLIGHTS, False)[1]
-    s, plain = filter.start(FLIGHTS), gaussian.start(model, FLIGHTS)
-    for k in samples(record, last=60):
-        s = filter.step(s, record.obs[:, k])
-        plain = gaussian.advance(model, gaussian.unscented, plain, record.obs[:, k])
+    model = model_of(plant, walk=WALK)
+    obs = flights_of(plant, "standard", 400_000, FLIGHTS, False)[1].obs[:, :60]
+    *_, s = states(plant, adaptive_filter(model, belief_of(plant).z_size, grid), obs)
+    *_, plain = states(plant, gaussian_filter(model, "unscented"), obs)
     assert not s.adapted.any()
     assert np.array_equal(s.filter.X, plain.X)
     assert np.array_equal(s.filter.P, plain.P)
@@ -200,15 +190,13 @@ def test_without_a_flag_it_is_the_augmented_ukf(plant, grid):
 
 def test_a_raised_variance_follows_a_jump_faster(b747):
     """After a fault the adaptive filter has adapted, and its error is smaller than that of the same filter without."""
-    model, filter = adaptive_filter(b747, "full", walk=0.01)
+    model = model_of(b747, walk=0.01)
     scenarios, record = flights_of(b747, "standard", 400_000, 12, True)
-    s, plain = filter.start(12), gaussian.start(model, 12)
-    errors = []
-    for k in range(record.obs.shape[1]):
-        s = filter.step(s, record.obs[:, k])
-        plain = gaussian.advance(model, gaussian.unscented, plain, record.obs[:, k])
+    adaptive = states(b747, adaptive_filter(model, belief_of(b747).z_size, "full"), record.obs)
+    plain, errors, s = readings(b747, gaussian_filter(model, "unscented"), record.obs), [], None
+    for k, (s, r) in enumerate(zip(adaptive, plain, strict=True)):
         truth = record.theta[:, k]
-        errors.append([np.abs(e.X[:, model.z] - truth).mean(axis=1) for e in (s.filter, plain)])
+        errors.append([np.abs(z - truth).mean(axis=1) for z in (s.filter.X[:, model.z], r.z)])
     mean = np.array(errors).mean(axis=0)
     changed = np.array([bool(scenario.faults) for scenario in scenarios]) & (s.adapted > 0)
     assert changed.sum() >= 3
@@ -223,18 +211,14 @@ def test_general_forms_agree_with_the_satellites_own():
 
     scenarios = [s.replace(faults=[loss(1, 0.5, 1000, 3000)]) for s in scenarios]
     record = simulate(plant, scenarios)
-    model = augmented(plant, z0_std=[1e-2] * 4, z_walk=[1e-5] * 4)
-    s = gaussian.start(model, 2)
+    model = model_of(plant, z0_std=[1e-2] * 4, z_walk=[1e-5] * 4)
     own = run(joint_ukf(plant), record.obs[:, :2000]).estimate
-    for k in range(2000):
-        s = gaussian.advance(model, gaussian.unscented, s, record.obs[:, k])
+    *_, s = states(plant, gaussian_filter(model, "unscented"), record.obs[:, :2000])
     jump = np.abs(own[:, -1] - 1.0).max()
     assert np.abs(1.0 + s.X[:, model.z] - own[:, -1]).max() < 0.05 * jump
-    _, filter = adaptive_filter(plant, "simplified")
-    a = filter.start(2)
-    for k in range(3000):
-        a = filter.step(a, record.obs[:, k])
-    theirs = run(covariance_adaptive_ukf(plant), record.obs).estimate[:, -1]
+    model = model_of(plant, walk=WALK)
+    *_, a = states(plant, adaptive_filter(model, belief_of(plant).z_size, "simplified"), record.obs)
+    theirs = run(make_diagnoser("sgaukf", plant), record.obs).estimate[:, -1]
     assert np.abs(1.0 + a.filter.X[:, model.z] - record.theta[:, -1]).max() < 0.05
     assert np.abs(1.0 + a.filter.X[:, model.z] - theirs).max() < 0.06
 
@@ -253,7 +237,9 @@ def test_oracle_is_told_when_and_not_what(plant):
     if single:
         other = next(mode.name for mode in plant.modes if mode.name != scenarios[single[0]].faults[0].mode)
         lie = [
-            s if i != single[0] else s.replace(faults=[type(s.faults[0])(other, "", s.faults[0].onset, [], s.faults[0].end)])
+            s
+            if i != single[0]
+            else s.replace(faults=[type(s.faults[0])(other, "", s.faults[0].onset, s.faults[0].effects, s.faults[0].end)])
             for i, s in enumerate(scenarios)
         ]
         again = run(make_diagnoser("told_onset_ekf", plant, scenarios=lie), record.obs[:, :400])

@@ -312,7 +312,7 @@ def test_loss_of_control_terminates(plant):
 
 
 def test_wrong_options_say_what_is_allowed(plant):
-    with pytest.raises(ValueError, match="kappa lies between"):
+    with pytest.raises(ValueError, match="kappa is a number from 0 to 1"):
         load_plant(huav.ID, kappa=2.0)
     with pytest.raises(ValueError, match="u_g, v_g"):
         simulate(plant, [FaultScenario(plant=huav.ID, steps=5, disturbance={"w_g": huav.gust(0, 1, 1)})])

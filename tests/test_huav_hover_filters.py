@@ -5,12 +5,8 @@ import itertools
 import numpy as np
 import pytest
 import scipy.linalg
-
 from baselines.filters.flag_thresholds import TABLE, calibrate
-from baselines.filters.hypothesis_bank import transitions
 from baselines.filters.matched_oracle import steady_filter
-from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, guarded, make_diagnoser, run
-from fdi_gym.estimation import flags, robust_three_stage, three_stage
 from fdi_gym.estimation.propagation import (
     Propagated,
     central_difference_rule,
@@ -19,6 +15,10 @@ from fdi_gym.estimation.propagation import (
     linear_output,
     trim_model,
 )
+
+from baselines.filters.hypothesis_bank import transitions
+from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, guarded, make_diagnoser, run
+from fdi_gym.estimation import flags, robust_three_stage, three_stage
 from fdi_gym.faults import FaultProcess, FaultScenario
 from fdi_gym.kernels import kernel
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal, load_plant

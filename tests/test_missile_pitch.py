@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fdi_gym.estimation import missile_model as model
+from baselines.filters import missile_model as model
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import missile_pitch as missile

@@ -11,45 +11,40 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
-from fdi_gym.estimation import missile_ekf as ekf
-from fdi_gym.estimation import missile_model as model
-from fdi_gym.estimation.missile_ekf import Filters
+from baselines.filters import missile_ekf as ekf
+from baselines.filters import missile_model as model
+from baselines.filters.missile_ekf import Filters
+from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
+from fdi_gym.estimation.augmented import Interval
+from fdi_gym.estimation.calibration import Persistence
+from fdi_gym.estimation.decision import Declared, Evidence, Reading, Rule, Verdict, declare, undeclared
 from fdi_gym.plant import Array, Plant
 
 
-class Ratios(NamedTuple):
-    """Decision state."""
+class Weighted(NamedTuple):
+    """The filters and how well each has fitted."""
 
+    filters: Filters
     J: Array  # (n, 6) forgetting log-likelihoods
-    over: Array  # (n,) consecutive samples with the best ratio over the threshold
-    under: Array  # (n,) consecutive samples with the best ratio under the release level
-    candidate: Array  # (n,) best label at the last "over" sample
-    alarm: Array  # (n,) bool
-
-    @property
-    def llr(self) -> Array:
-        """Log-likelihood ratios of labels 1..5 against none (n, 5)."""
-        return self.J[:, 1:] - self.J[:, :1]
 
 
-def decide(
-    before: Ratios, log_likelihood: Array, forgetting: float, threshold: float, alarm_after: int,
-    release: float | None, release_after: int,
-) -> Ratios:  # fmt: skip
-    """The ratios and the decision one sample later; `release` None latches the alarm."""
-    J = forgetting * before.J + log_likelihood
-    llr = J[:, 1:] - J[:, :1]
-    best, largest = 1 + np.argmax(llr, axis=1), llr.max(axis=1)
-    exceeds = largest > threshold
-    over = np.where(exceeds, before.over + 1, 0)
-    candidate = np.where(exceeds, best, before.candidate)
-    alarm = before.alarm | (over >= alarm_after)
-    under = before.under
-    if release is not None:
-        under = np.where(largest < release, under + 1, 0)
-        alarm = alarm & (under < release_after)
-    return Ratios(J, over, under, candidate, alarm)
+def likelihood_ratios(threshold: float, release: float | None, after: Persistence) -> Rule:
+    """The fault whose log-likelihood ratio against none is largest, as long as that was over the threshold.
+
+    Given up when the largest is under `release`; None keeps the alarm for good.
+    """
+    floor = -np.inf if release is None else release
+
+    def step(s: Declared, k: Array, r: Reading, informed: Array) -> tuple[Declared, Verdict]:
+        assert r.cost is not None
+        ratios = 0.5 * (r.cost[:, :1] - r.cost[:, 1:])
+        largest = ratios.max(axis=1)
+        over = largest > threshold
+        best = np.where(over, 1 + np.argmax(ratios, axis=1), s.best)
+        s = declare(s, best, over, largest < floor, after, informed)
+        return s, Verdict(s.label > 0, s.label, evidence=Evidence(r.cost))
+
+    return Rule(undeclared, step)
 
 
 @diagnoser("augmented_ekf_bank", "Augmented EKF bank, likelihood ratios, latched")
@@ -75,16 +70,23 @@ def augmented_ekf_bank(
     model.require_missile(plant, "the augmented filter bank", noisy=True)
     R = plant.R[:2, :2]
 
-    def init(n: int) -> tuple[Filters, Ratios]:
-        count = np.zeros(n, np.int64)
-        return ekf.start(n), Ratios(np.zeros((n, 6)), count, count, count, np.zeros(n, bool))
+    def begin(s: Weighted, at: Interval, y: Array) -> Weighted:
+        filters = ekf.begin(s.filters, at, y, R, ekf.SIGMA_THETA, ekf.SIGMA_RHO)
+        return Weighted(filters, filters.log_likelihood)
 
-    def update(state: tuple[Filters, Ratios], obs: Array) -> tuple[tuple[Filters, Ratios], Diagnosis]:
-        filters, ratios = state
-        sample = model.read(plant, obs)
-        filters = ekf.update(ekf.predict_or_begin(filters, sample, ekf.at_first_sample(sample, R)), R)
-        ratios = decide(ratios, filters.log_likelihood, forgetting, threshold, alarm_after, release, release_after)
-        mode = np.where(ratios.alarm, ratios.candidate, 0)
-        return (filters, ratios), Diagnosis(ratios.alarm, mode, *ekf.declared_theta(filters, mode))
+    def predict(s: Weighted, at: Interval) -> Weighted:
+        return s._replace(filters=ekf.predict(s.filters, at))
 
-    return Diagnoser(init, update)
+    def update(s: Weighted, at: Interval, y: Array, seen: Array) -> Weighted:
+        filters = ekf.update(s.filters, y, seen, R)
+        any_seen = seen[:, model.SENSORS].any(axis=1, keepdims=True)
+        return Weighted(filters, np.where(any_seen, forgetting * s.J + filters.log_likelihood, s.J))
+
+    def read(s: Weighted) -> Reading:
+        best = np.eye(6)[np.argmax(s.J, axis=1)]
+        found = ekf.reading(s.filters, best, -2.0 * s.J)
+        return found._replace(signals={**(found.signals or {}), "log-likelihood ratios": s.J[:, 1:] - s.J[:, :1]})
+
+    filter = Filter(lambda n: Weighted(ekf.start(n), np.zeros((n, 6))), predict, update, read, True, begin, model.SENSORS)
+    after = Persistence(alarm_after, 1, release_after)
+    return diagnoser_of(plant, filter, ekf.only_declared(likelihood_ratios(threshold, release, after)))

@@ -14,10 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
-from fdi_gym.estimation import missile_ekf as ekf
-from fdi_gym.estimation import missile_model as model
-from fdi_gym.estimation.missile_ekf import Filters
+from baselines.filters import missile_ekf as ekf
+from baselines.filters import missile_model as model
+from baselines.filters.missile_ekf import JAM, Filters
+from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
+from fdi_gym.estimation import mixing
+from fdi_gym.estimation.augmented import Interval
+from fdi_gym.estimation.decision import Reading, by_candidate
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.missile_pitch import DEG, DT
 
@@ -27,11 +30,11 @@ SIGMA_RHO = 0.08 / 3**0.5
 MU_MIN = 1e-8
 
 
-class IMM(NamedTuple):
-    """State at sample k."""
+class Interacting(NamedTuple):
+    """The filters and the probabilities of their modes."""
 
     filters: Filters
-    mu: Array  # (n, 6) mode probabilities
+    mu: Array  # (n, 6)
 
 
 def transition(p: float) -> Array:
@@ -41,39 +44,12 @@ def transition(p: float) -> Array:
     return Pi
 
 
-def matched(weights: list[Array], parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Mean (n, m, 6) and covariance (n, m, 6, 6) of a mixture, spread of the means included; weights (n, m) sum to 1."""
-    mean = np.sum([w[..., None] * z for w, (z, _) in zip(weights, parts, strict=True)], axis=0)
-    P = np.zeros((*mean.shape, mean.shape[-1]))
-    for w, (z, covariance) in zip(weights, parts, strict=True):
-        d = z - mean
-        P += w[..., None, None] * (covariance + d[..., :, None] * d[..., None, :])
-    return mean, P
-
-
-def without_theta(z: Array, P: Array) -> tuple[Array, Array]:
-    """The estimate with the fault parameter at 0, known exactly."""
-    z, P = z.copy(), P.copy()
-    z[..., 2], P[..., 2, :], P[..., :, 2] = 0.0, 0.0, 0.0
-    return z, P
-
-
-def mix(state: IMM, Pi: Array) -> IMM:
-    """The filters' interaction before a prediction, and the predicted mode probabilities."""
-    f, mu = state
-    joint = mu[:, :, None] * Pi  # (n, from, to)
-    ahead = joint.sum(axis=1)
-    share = joint / ahead[:, None, :]
-    healthy = without_theta(f.z, f.P)
-    z, P = np.empty_like(f.z), np.empty_like(f.P)
-    parts = [(healthy[0][:, i : i + 1], healthy[1][:, i : i + 1]) for i in range(6)]
-    z[:, :1], P[:, :1] = matched([share[:, i, :1] for i in range(6)], parts)
-    begun_z, begun_P = np.repeat(healthy[0][:, :1], 5, axis=1), np.repeat(healthy[1][:, :1], 5, axis=1)
-    begun_z[..., 2], begun_P[..., 2, 2] = RESTART_MEAN[1:], RESTART_SD[1:] ** 2
-    begun_z[:, 3, 2] = f.sample.delta
-    own = np.diagonal(share, axis1=1, axis2=2)[:, 1:]
-    z[:, 1:], P[:, 1:] = matched([own, share[:, 0, 1:]], [(f.z[:, 1:], f.P[:, 1:]), (begun_z, begun_P)])
-    return IMM(f._replace(z=z, P=P), ahead)
+def mixed(f: Filters, w: Array) -> Filters:
+    """The filters after their interaction: theta belongs to each mode alone. w (n, to, from)."""
+    m0 = np.tile(RESTART_MEAN, (len(w), 1))
+    m0[:, JAM] = f.known.delta
+    z, P = mixing.mix(w, f.z, f.P, slice(2, 3), m0[..., None], (RESTART_SD**2)[:, None, None])
+    return f._replace(z=z, P=P)
 
 
 @diagnoser("augmented_ekf_imm", "Augmented EKFs as interacting multiple models")
@@ -97,19 +73,24 @@ def augmented_ekf_imm(
     R, Pi = plant.R[:2, :2], transition(DT / dwell)
     sigma_theta = RESTART_SD if interaction else ekf.SIGMA_THETA
 
-    def init(n: int) -> IMM:
-        return IMM(ekf.start(n), np.tile(np.eye(6)[0], (n, 1)))
+    def start(n: int) -> Interacting:
+        return Interacting(ekf.start(n), np.tile(np.eye(6)[0], (n, 1)))
 
-    def update(state: IMM, obs: Array) -> tuple[IMM, Diagnosis]:
-        sample, begun = model.read(plant, obs), state.filters.begun
-        mixed = mix(state, Pi) if interaction else IMM(state.filters, state.mu @ Pi)
-        initial = ekf.at_first_sample(sample, R, sigma_theta, sigma_rho)
-        filters = ekf.update(ekf.predict_or_begin(mixed.filters, sample, initial), R)
-        mu = np.where(begun[:, None], mixed.mu, state.mu)
-        mu = mu * np.exp(filters.log_likelihood - filters.log_likelihood.max(axis=1, keepdims=True))
-        mu = np.maximum(mu / mu.sum(axis=1, keepdims=True), MU_MIN)
-        mode = np.argmax(mu, axis=1)
-        answer = Diagnosis(mode > 0, mode, *ekf.declared_theta(filters, mode), mu / mu.sum(axis=1, keepdims=True))
-        return IMM(filters, mu), answer
+    def begin(s: Interacting, at: Interval, y: Array) -> Interacting:
+        return Interacting(ekf.begin(s.filters, at, y, R, sigma_theta, sigma_rho), np.maximum(s.mu, MU_MIN))
 
-    return Diagnoser(init, update)
+    def predict(s: Interacting, at: Interval) -> Interacting:
+        c, w = mixing.ahead(s.mu, Pi)
+        return Interacting(ekf.predict(mixed(s.filters, w) if interaction else s.filters, at), c)
+
+    def update(s: Interacting, at: Interval, y: Array, seen: Array) -> Interacting:
+        filters = ekf.update(s.filters, y, seen, R)
+        return Interacting(filters, mixing.weigh(s.mu, filters.log_likelihood, MU_MIN))
+
+    def read(s: Interacting) -> Reading:
+        mu = s.mu / s.mu.sum(axis=1, keepdims=True)
+        return ekf.reading(s.filters, mu, -2.0 * np.log(np.maximum(mu, MU_MIN)), mu)
+
+    filter = Filter(start, predict, update, read, True, begin, model.SENSORS)
+    rule = by_candidate(lambda r, label: np.argmax(np.asarray(r.probs), axis=1), 1)
+    return diagnoser_of(plant, filter, ekf.only_declared(rule))

@@ -5,23 +5,24 @@ Gaussian noise, so the size integrates out in closed form. What is left is a sum
 
 - `bayes_bank`: one permanent fault at an unknown onset. With the true priors it maximises the expected share of right
   labels: no diagnoser can beat it on average on the standard process.
-- `switching_bayes_bank`: faults that come and go; approximate (geometric gaps, transients cut after 4 s).
-- `known_onset_oracle`: is told the fault windows, not what happens in them.
+- `baselines.filters.switching_bayes_bank`: faults that come and go; approximate.
+- `baselines.oracles.known_onset_oracle`: is told the fault windows, not what happens in them.
 
-Per onset: sensitivity of the filter's error M, of its innovation H; information G = sum H' S^-1 H, g = sum H' S^-1 nu.
+Per onset: sensitivity of the filter's error M; information G = sum H' S^-1 H, g = sum H' S^-1 nu.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import log_ndtr, logsumexp
 
-from baselines.filters.windowed_nis import SteadyFilter, steady_filter
-from fdi_gym.diagnosis import Diagnoser, Diagnosis, NotApplicableError, diagnoser
-from fdi_gym.faults import FaultScenario
+from baselines.filters import kalman_filter
+from baselines.filters.kalman_filter import Healthy, sense
+from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser, diagnoser_of
+from fdi_gym.estimation.augmented import Interval
+from fdi_gym.estimation.decision import Reading, Rule, by_candidate
 from fdi_gym.plant import Array, Plant
 
 # (label, type, prior weight): per surface LOE 0.25, random position 0.15, jam 0.10
@@ -53,14 +54,14 @@ def log_mean_exp(l: Array, a: Array, lo: float, hi: float) -> tuple[Array, Array
     return np.where(flat, 0.0, value), np.where(flat, 0.5 * (lo + hi), np.clip(mean, lo, hi))
 
 
-class Prior(NamedTuple):
-    """What a bank believes about the size of a fault."""
+class Sizes(NamedTuple):
+    """How large a fault may be: uniform."""
 
     gamma: tuple[float, float]
     b_max: tuple[float, float]
 
 
-def marginals(G: Array, g: Array, u_onset: Array, prior: Prior) -> tuple[Array, Array]:
+def marginals(G: Array, g: Array, u_onset: Array, sizes: Sizes) -> tuple[Array, Array]:
     """log likelihood ratio of each type against no fault (..., 6), and the expected theta under it (..., 6, 4).
 
     G (..., 4, 4), g (..., 4); u_onset (..., 2) is the command at the onset, where a jam holds its surface.
@@ -69,26 +70,16 @@ def marginals(G: Array, g: Array, u_onset: Array, prior: Prior) -> tuple[Array, 
     value, theta = np.empty((*shape, 6)), np.zeros((*shape, 6, 4))
     for s in range(2):
         j, first = 2 + s, 3 * s
-        value[..., first], theta[..., first, s] = log_mean_exp(g[..., s], G[..., s, s], *prior.gamma)
+        value[..., first], theta[..., first, s] = log_mean_exp(g[..., s], G[..., s, s], *sizes.gamma)
         # a stuck surface: theta = -e_s + m e_j, so the log ratio is a constant, plus (g_j + G_sj) m - G_jj m^2 / 2
         constant, slope = -g[..., s] - 0.5 * G[..., s, s], g[..., j] + G[..., s, j]
-        b = prior.b_max[s]
+        b = sizes.b_max[s]
         mass, mean = log_mean_exp(slope, G[..., j, j], -b, b)
         value[..., first + 1], theta[..., first + 1, j] = constant + mass, mean
         m = u_onset[..., s]
         value[..., first + 2], theta[..., first + 2, j] = constant + slope * m - 0.5 * G[..., j, j] * m * m, m
         theta[..., first + 1, s] = theta[..., first + 2, s] = -1.0
     return value, theta
-
-
-def sense(M: Array, G: Array, g: Array, E: Array, nu: Array, nominal: SteadyFilter) -> tuple[Array, Array, Array]:
-    """One step of the sensitivities: H = A M + E, then G, g and M = (I - K) H. E is 0 once the fault is gone.
-
-    M, G (n, hypotheses, 4, 4), g (n, hypotheses, 4), E broadcasts to M, nu (n, 4).
-    """
-    H = nominal.model.A @ M + E
-    HtW = np.swapaxes(H, -1, -2) @ nominal.W
-    return H - nominal.K @ H, G + HtW @ H, g + (HtW @ nu[:, None, :, None])[..., 0]
 
 
 def check(plant: Plant) -> None:
@@ -101,18 +92,27 @@ def check(plant: Plant) -> None:
         raise NotApplicableError("its hypotheses are the Boeing 747's single aileron and rudder faults")
 
 
-def b_max_of(plant: Plant) -> tuple[float, float]:
-    """Largest random stuck position of aileron and rudder in the plant's standard process, deg."""
-    from fdi_gym.plants.b747_lateral import B_STUCK_MAX
-
-    return B_STUCK_MAX[plant.options["variant"].split("/")[0]]
+def most_probable() -> Rule:
+    """The label is the most probable one, at once."""
+    return by_candidate(lambda r, label: np.argmax(np.asarray(r.probs), axis=1), 1)
 
 
-def answer(log_probs: Array, theta: Array | None = None) -> Diagnosis:
-    """The diagnosis from log probabilities (n, 5) of the labels, normalised here."""
-    probs = np.exp(log_probs - logsumexp(log_probs, axis=1, keepdims=True))
-    mode = np.argmax(probs, axis=1)
-    return Diagnosis(mode > 0, mode, theta, None, probs)
+def label_probabilities(weights: Array) -> Array:
+    """Probabilities of the four faulty labels (..., 4) from those of the types (..., 6)."""
+    return np.stack([weights[..., label == LABEL].sum(axis=-1) for label in range(1, 5)], axis=-1)
+
+
+class Onsets(NamedTuple):
+    """State: the nominal filter, and what each onset hypothesis has gathered; and the answer."""
+
+    healthy: Healthy
+    M: Array  # (n, T, 4, 4)
+    G: Array  # (n, T, 4, 4)
+    g: Array  # (n, T, 4)
+    u_onset: Array  # (n, T, 2)
+    log_prior: Array  # (n, 1 + T) of no fault so far, and of each onset; -inf for one that is still to come
+    probs: Array  # (n, 5)
+    z: Array  # (n, 4)
 
 
 @diagnoser("bayes_bank", "Bayes bank over onsets and types, true priors: the bound of the standard process")
@@ -120,124 +120,96 @@ def bayes_bank(
     plant: Plant,
     *,
     gamma: tuple[float, float] = (-0.9, -0.3),
+    b_max: tuple[float, float] = (4.0, 2.0),
     first_onset: int = 200,
     last_onset: int = 800,
     grid: int = 10,
+    horizon: int = 1200,
     p_fault: float = 0.8,
     decide_every: int = 1,
 ) -> Diagnoser:
     """The exact classifier of one permanent fault at an unknown onset.
 
+    On a flight that is longer than its process's, faults go on beginning after it at the rate of before: a new onset then
+    takes the place of the least probable one.
+
     Args:
         plant: The Boeing 747 with single-fault labels.
         gamma: Range of the loss of effectiveness.
+        b_max: Largest random stuck position of aileron and rudder [deg].
         first_onset, last_onset, grid: Onset hypotheses, in samples.
+        horizon: Length of the process's flights, in samples.
         p_fault: Prior probability of a fault.
-        decide_every: Samples between evaluations of the posterior; the answer is held in between.
+        decide_every: Samples between evaluations of the posterior; the answer stands in between.
 
     Raises:
         NotApplicableError: Another plant.
     """
     check(plant)
-    nominal, prior = steady_filter(plant), Prior(gamma, b_max_of(plant))
-    taus = np.arange(first_onset, last_onset + 1, grid)
-    T = len(taus)
+    f, sizes = kalman_filter.nominal_filter(plant), Sizes((gamma[0], gamma[1]), (b_max[0], b_max[1]))
+    T = len(range(first_onset, last_onset + 1, grid))
+    each = np.log(p_fault / T)
 
-    def init(n: int) -> Any:
-        zeros = [np.zeros((n, T, 4, 4)), np.zeros((n, T, 4, 4)), np.zeros((n, T, 4)), np.zeros((n, T, 2))]
-        none = answer(np.tile(np.log([1.0] + [1e-300] * 4), (n, 1)), np.zeros((n, 4)))
-        return 0, np.zeros((n, 4)), *zeros, none
+    def start(n: int) -> Onsets:
+        log_prior = np.full((n, 1 + T), -np.inf)
+        log_prior[:, 0] = 0.0
+        return Onsets(
+            kalman_filter.start(f, plant, n), np.zeros((n, T, 4, 4)), np.zeros((n, T, 4, 4)), np.zeros((n, T, 4)),
+            np.zeros((n, T, 2)), log_prior, np.tile([1.0, 0, 0, 0, 0], (n, 1)), np.zeros((n, 4)),
+        )  # fmt: skip
 
-    def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
-        k, x, M, G, g, u_onset, last = state
-        if k == 0:
-            return (1, *state[1:]), last
-        y, u, _ = plant.split(obs)
-        x, nu = nominal.step(x, u, y)
-        m = int(np.searchsorted(taus, k - 1, side="right"))  # onsets at or before the step from k - 1 to k
+    def posterior(s: Onsets, m: int) -> tuple[Array, Array]:
+        """log weights (n, 1 + 6 m) of no fault and of each onset and type, and the expected deviations (n, m, 6, 4)."""
+        ratio, z = marginals(s.G[:, :m], s.g[:, :m], s.u_onset[:, :m], sizes)
+        types = ratio + LOG_WEIGHT + s.log_prior[:, 1 : m + 1, None]
+        return np.concatenate([s.log_prior[:, :1], types.reshape(len(z), -1)], axis=1), z
+
+    def begin(s: Onsets, step: Array, u: Array) -> Onsets:
+        """New onset hypotheses, where one begins with this step (n,)."""
+        late = step - first_onset
+        new = np.flatnonzero((late >= 0) & (late % grid == 0) & ((step <= last_onset) | (step >= horizon)))
+        if not new.size:
+            return s
+        slot = late[new] // grid
+        M, G, g, u_onset, log_prior = (a.copy() for a in (s.M, s.G, s.g, s.u_onset, s.log_prior))
+        beyond = slot >= T
+        if beyond.any():
+            log, _ = posterior(s, T)
+            slot[beyond] = np.argmin(log[new[beyond], 1:].reshape(-1, T, 6).max(axis=2), axis=1)
+        M[new, slot], G[new, slot], g[new, slot], u_onset[new, slot] = 0.0, 0.0, 0.0, u[new]
+        share = np.where(beyond, np.exp(each) / (1 - p_fault), 1.0)  # of what is left of "no fault", once it is p_fault
+        mass = np.exp(log_prior[new, 0])
+        begun = np.where(beyond, mass * (1 - np.exp(-share)), np.exp(each))
+        log_prior[new, 1 + slot] = np.log(begun)
+        log_prior[new, 0] = np.log(mass - begun)
+        return s._replace(M=M, G=G, g=g, u_onset=u_onset, log_prior=log_prior)
+
+    def count(k: Array) -> int:
+        """Slots that any episode has in use."""
+        return int(np.clip((k.max() - 1 - first_onset) // grid + 1, 0, T))
+
+    def predict(s: Onsets, at: Interval) -> Onsets:
+        return begin(s, at.k - 1, at.u)._replace(healthy=kalman_filter.predict(f, s.healthy, at.u))
+
+    def update(s: Onsets, at: Interval, y: Array, seen: Array) -> Onsets:
+        healthy, m = kalman_filter.correct(f, s.healthy, y, seen), count(at.k)
+        M, G, g = s.M, s.G, s.g
         if m:
-            if taus[m - 1] == k - 1:
-                u_onset = u_onset.copy()
-                u_onset[:, m - 1] = u
             M, G, g = M.copy(), G.copy(), g.copy()
-            M[:, :m], G[:, :m], g[:, :m] = sense(M[:, :m], G[:, :m], g[:, :m], nominal.model.E(u)[:, None], nu, nominal)
-        if k % decide_every == 0:
-            ratio, theta = marginals(G[:, :m], g[:, :m], u_onset[:, :m], prior)
-            log_w = np.concatenate(
-                [
-                    np.full((len(y), 1), np.log(1 - p_fault + p_fault * (T - m) / T)),
-                    (ratio + LOG_WEIGHT + np.log(p_fault / T)).reshape(len(y), -1),
-                ],
-                axis=1,
-            )
-            w = np.exp(log_w - logsumexp(log_w, axis=1, keepdims=True))
-            types = w[:, 1:].reshape(len(y), m, 6)
-            probs = np.column_stack([w[:, 0], *(types[:, :, label == LABEL].sum(axis=(1, 2)) for label in range(1, 5))])
-            mean = (types[..., None] * theta).sum(axis=(1, 2))
-            mode = np.argmax(probs, axis=1)
-            last = Diagnosis(mode > 0, mode, mean, None, probs)
-        return (k + 1, x, M, G, g, u_onset, last), last
+            E = f.model.E(at.u)[:, None] * np.isfinite(s.log_prior[:, 1 : m + 1, None, None])
+            M[:, :m], G[:, :m], g[:, :m] = sense(f, healthy, M[:, :m], G[:, :m], g[:, :m], E)
+        s = s._replace(healthy=healthy, M=M, G=G, g=g)
+        now = at.k % decide_every == 0
+        if not now.any():
+            return s
+        log, z = posterior(s, m)
+        w = np.exp(log - logsumexp(log, axis=1, keepdims=True))
+        types = w[:, 1:].reshape(len(y), m, 6)
+        probs = np.column_stack([w[:, 0], label_probabilities(types).sum(axis=1)])
+        mean = (types[..., None] * z).sum(axis=(1, 2))
+        return s._replace(probs=np.where(now[:, None], probs, s.probs), z=np.where(now[:, None], mean, s.z))
 
-    return Diagnoser(init, update)
+    def read(s: Onsets) -> Reading:
+        return Reading(s.z, x=s.healthy.x, Px=s.healthy.P, nu=s.healthy.nu, probs=s.probs)
 
-
-@diagnoser("known_onset_oracle", "Is told when each fault begins and ends, not what it is", clairvoyant=True)
-def known_onset_oracle(
-    plant: Plant, *, scenarios: Sequence[FaultScenario], gamma: tuple[float, float] = (-0.9, -0.3)
-) -> Diagnoser:
-    """The Bayes classifier inside known fault windows; label 0 outside.
-
-    Args:
-        plant: The Boeing 747 with single-fault labels.
-        scenarios: The truth, one per episode of the batch.
-        gamma: Range of the loss of effectiveness.
-
-    Raises:
-        NotApplicableError: Another plant.
-    """
-    check(plant)
-    nominal, prior = steady_filter(plant), Prior(gamma, b_max_of(plant))
-    steps = max(s.steps for s in scenarios)
-    active, begins = (np.zeros((len(scenarios), steps + 1), bool) for _ in range(2))
-    for i, scenario in enumerate(scenarios):
-        for fault in scenario.faults:
-            active[i, fault.onset : fault.end] = True
-            begins[i, fault.onset] = True
-
-    def init(n: int) -> Any:
-        # each episode carries its own windows, so that it can be told apart in any batch
-        if n != len(scenarios):
-            raise ValueError(f"there are scenarios for {len(scenarios)} episodes, not for {n}")
-        return (
-            0,
-            active,
-            begins,
-            np.zeros((n, 4)),
-            np.zeros((n, 4, 4)),
-            np.zeros((n, 4, 4)),
-            np.zeros((n, 4)),
-            np.zeros((n, 2)),
-        )
-
-    def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
-        k, active, begins, x, M, G, g, u_onset = state
-        n = len(obs)
-        theta, log_probs = np.zeros((n, 4)), np.tile(np.log([1.0] + [1e-300] * 4), (n, 1))
-        if k > 0:
-            y, u, _ = plant.split(obs)
-            x, nu = nominal.step(x, u, y)
-            on, begin = active[:, k - 1], begins[:, k - 1]
-            fresh = (begin | ~on)[:, None, None]
-            M, G, g = np.where(fresh, 0.0, M), np.where(fresh, 0.0, G), np.where(fresh[..., 0], 0.0, g)
-            u_onset = np.where(begin[:, None], u, u_onset)
-            E = nominal.model.E(u) * on[:, None, None]
-            M, G, g = (a[:, 0] for a in sense(M[:, None], G[:, None], g[:, None], E[:, None], nu, nominal))
-            ratio, sizes = marginals(G, g, u_onset, prior)
-            log_w = ratio + LOG_WEIGHT
-            w = np.exp(log_w - logsumexp(log_w, axis=1, keepdims=True))
-            probs = np.column_stack([w[:, label == LABEL].sum(axis=1) for label in range(1, 5)])
-            log_probs = np.where(on[:, None], np.log(np.maximum(np.column_stack([np.zeros(n), probs]), 1e-300)), log_probs)
-            theta = (w[..., None] * sizes).sum(axis=1) * on[:, None]
-        return (k + 1, active, begins, x, M, G, g, u_onset), answer(log_probs, theta)
-
-    return Diagnoser(init, update)
+    return diagnoser_of(plant, Filter(start, predict, update, read, first_sample=False), most_probable())

@@ -54,7 +54,6 @@ def secants(plant: Plant, size: Array) -> tuple[Array, Array]:
     return np.where(down | ~up, -size, 0.0), np.where(up | ~down, size, 0.0)
 
 
-
 class Signatures(NamedTuple):
     """How a function of the augmented model changes."""
 
@@ -128,9 +127,7 @@ def glr_filter(plant: Plant, model: AugmentedModel, size: Array, onsets: int, sp
         h = linearised(model, lambda points: model.h(points, at), s.X, low, high, slice(None))
         cross = s.P @ T(h.A)
         signature = (h.A[:, None] @ s.M + h.E[:, None]) * s.faults[:, None, None, None]  # (n, onsets, m, p)
-        nu, S, cross, signature_t = masked(
-            seen, y[:, model.sensors] - h.mean, h.A @ cross + model.R, cross, T(signature)
-        )
+        nu, S, cross, signature_t = masked(seen, y[:, model.sensors] - h.mean, h.A @ cross + model.R, cross, T(signature))
         K = right_divide(cross, S)
         weighed = signature_t @ right_divide(np.eye(m), S)[:, None]
         informed = (seen.any(axis=1) & s.faults)[:, None, None]
@@ -161,9 +158,7 @@ def glr_filter(plant: Plant, model: AugmentedModel, size: Array, onsets: int, sp
 
 
 @diagnoser("glr_ekf", "GLR test with propagated fault signatures on a healthy extended Kalman filter, for any plant")
-def glr_ekf(
-    plant: Plant, belief: Belief, calibration: Calibration, *, onsets: int = 8, spacing: int = 20
-) -> Diagnoser:
+def glr_ekf(plant: Plant, belief: Belief, calibration: Calibration, *, onsets: int = 8, spacing: int = 20) -> Diagnoser:
     """The test with its decision.
 
     Args:

@@ -8,28 +8,32 @@ less. H. A. P. Blom, Y. Bar-Shalom, IEEE Transactions on Automatic Control 33(8)
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 
-from fdi_gym.diagnosis import Diagnoser, Diagnosis, NotApplicableError, diagnoser
-from fdi_gym.estimation.flags import label_sets
-from fdi_gym.estimation.kalman import T, right_divide, symmetric, times
-from fdi_gym.estimation.propagation import fault_inputs, linear_output
-from fdi_gym.estimation.unknown_inputs import initial_covariance
+from baselines.filters.unknown_inputs import initial_covariance, of_all_channels
+from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser, diagnoser_of
+from fdi_gym.estimation import mixing
+from fdi_gym.estimation.augmented import Interval
+from fdi_gym.estimation.belief import fault_inputs, noisy_sensors
+from fdi_gym.estimation.decision import Reading, by_candidate
+from fdi_gym.estimation.kalman import T, correct, log_likelihood, times
+from fdi_gym.estimation.labels import channel_sets
+from fdi_gym.estimation.linear import linear_output
 from fdi_gym.plant import Array, Plant
 
+LEAST = 1e-9  # probability of a hypothesis
 
-class Bank(NamedTuple):
-    """State of the bank: L filters of X = [x; b; d], their probabilities, and the declared hypothesis."""
+
+class Hypotheses(NamedTuple):
+    """State of the bank: L filters of X = [x; b; d], and their probabilities."""
 
     X: Array  # (n, L, N)
     P: Array  # (n, L, N, N)
-    mu: Array  # (n, L)
-    declared: Array  # (n,) hypothesis
-    candidate: Array  # (n,) what the last step favoured,
-    times: Array  # (n,) and on how many steps in a row
+    mu: Array  # (n, L) after the last update
+    c: Array  # (n, L) predicted
 
 
 def transitions(sets: Array, one_more: float, one_less: float) -> Array:
@@ -64,7 +68,7 @@ def hypothesis_bank(
     Args:
         plant: A plant whose fault enters additively and whose sensors are linear.
         channels: The fault channels. Default: all.
-        x0_std: Standard deviations of the initial state; the helicopter brings its own (`Plant.tuning`).
+        x0_std: Standard deviations of the initial state.
         d0_std: Of the initial disturbance.
         b_onset: Standard deviation of a fault at its onset, per entry of `plant.estimated` [rad].
         b_step: Of its random walk per step.
@@ -73,100 +77,84 @@ def hypothesis_bank(
         one_more, one_less: Transition probabilities per step to each hypothesis with one fault more or less.
         alarm: "none" is left when its probability is below this ...
         release: ... and taken again when it is above this,
-        persist: after so many steps in a row with the same verdict.
+        persist: after so many samples in a row with the same verdict.
 
     Raises:
         NotApplicableError: The plant is not of that kind, or the settings have not one entry per fault.
     """
-    inputs, H = fault_inputs(plant, channels), linear_output(plant)
+    inputs, sensors = fault_inputs(plant, channels), noisy_sensors(plant)
+    H, R = linear_output(plant, sensors), plant.R[np.ix_(sensors, sensors)]
     if x0_std is None:
-        raise NotApplicableError(f"needs x0_std, the spread of the initial state, which {plant.id} does not bring")
+        raise NotApplicableError(f"needs x0_std, the spread of the initial state, which is not given for {plant.id}")
     for name, value in (("b_onset", b_onset), ("b_step", b_step)):
         if len(value) != len(plant.estimated):
             raise NotApplicableError(f"{name} needs one entry per fault of {plant.id}: {len(plant.estimated)}")
     s0, walk = np.asarray(b_onset)[inputs.estimated], np.asarray(b_step)[inputs.estimated]
-    labels, sets = label_sets(plant, inputs)
+    labels, sets = channel_sets(plant, inputs)
     L, p = sets.shape
     n_x, q = len(plant.states), len(plant.disturbances)
-    N, b_part = n_x + p + q, slice(n_x, n_x + p)
+    N, x, b = n_x + p + q, slice(0, n_x), slice(n_x, n_x + p)
     Pi = transitions(sets, one_more, one_less)
     keep = np.ones((L, N))
-    keep[:, b_part] = sets
+    keep[:, b] = sets
 
-    def blocks(x: Array, b: Array, d_std: float) -> Array:
-        diagonal = [scipy.linalg.block_diag(x, np.diag(b**2 * m), d_std**2 * np.eye(q)) for m in sets]
+    def blocks(state: Array, fault: Array, d_std: float) -> Array:
+        diagonal = [scipy.linalg.block_diag(state, np.diag(fault**2 * m), d_std**2 * np.eye(q)) for m in sets]
         return np.asarray(diagonal)
 
     P0 = blocks(initial_covariance(plant, x0_std), s0, d0_std)
-    Qa = blocks(plant.Q, walk, d_step)
+    Q = blocks(plant.Q, walk, d_step)
     X0 = np.tile(np.concatenate([plant.trim_state, np.zeros(p + q)]), (L, 1))
     mu0 = np.full(L, (1 - healthy) / (L - 1))
     mu0[0] = healthy
     width = np.concatenate([np.full(n_x + p, 1e-5), np.ones(q)])  # of the Jacobian's differences: x, b; d in m/s
     offsets = np.concatenate([np.diag(width), -np.diag(width)])
 
-    def init(n: int) -> Any:
-        copies = [np.tile(a, (n, *[1] * a.ndim)) for a in (X0, P0, mu0)]
-        return 0, Bank(*copies, *(np.zeros(n, np.int64) for _ in range(3)))
+    def start(n: int) -> Hypotheses:
+        X, P, mu = (np.tile(a, (n, *[1] * a.ndim)) for a in (X0, P0, mu0))
+        return Hypotheses(X, P, mu, mu)
 
-    def model(t: float, X: Array, u: Array) -> Array:
-        """F for all points X (n, m, N) in one call."""
+    def ahead(X: Array, at: Interval) -> Array:
+        """All points X (n, m, N) one sample later, in one call."""
         theta = np.tile(plant.nominal_theta, (*X.shape[:2], 1))
-        theta[..., inputs.entries] += X[..., b_part]
-        return plant.propagate(t, X[..., :n_x], u, theta, X[..., n_x + p :] if q else None)
+        theta[..., inputs.entries] += X[..., b]
+        return plant.propagate((at.k - 1) * plant.dt, X[..., x], at.u, theta, X[..., n_x + p :] if q else None)
 
-    def step(s: Bank, t: float, u: Array, y: Array) -> Bank:
-        X, P, mu = s.X, s.P, s.mu
-        n = len(y)
-        # (1) where the Jacobian is taken; (2) mixing
-        centre = times(T(X), mu)
-        c = times(Pi.T, mu)
-        w = T(Pi * mu[:, :, None]) / c[:, :, None]  # (n, j, i)
-        Z = X[:, None] * keep[:, None]  # (n, j, i, N)
-        Xm = (w[:, :, None] @ Z)[:, :, 0]
-        spread = np.sqrt(w)[..., None] * (Z - Xm[:, :, None])
-        fresh = (w @ ~sets) * sets * s0**2  # variance of the faults that are new in j
-        Pm = (w @ P.reshape(n, L, N * N)).reshape(n, L, N, N) * (keep[:, :, None] * keep[:, None])
-        Pm += T(spread) @ spread
-        Pm[..., range(n_x, n_x + p), range(n_x, n_x + p)] += fresh
-        # (3) one Jacobian for all hypotheses; (4) a Kalman filter each
-        F = model(t, np.concatenate([Xm, centre[:, None] + offsets], axis=1), u)
-        Phi = np.tile(np.eye(N), (n, 1, 1, 1))
-        Phi[:, 0, :n_x] = T((F[:, L : L + N] - F[:, L + N :]) / (2 * width[:, None]))
-        x = Xm.copy()
-        x[..., :n_x] = F[:, :L]
-        P = Phi @ Pm @ T(Phi) + Qa
-        PHt = P[..., :n_x] @ H.T
-        C = H @ PHt[:, :, :n_x] + plant.R
-        K = right_divide(PHt, C)
-        nu = y[:, None] - x[..., :n_x] @ H.T
-        x = x + (K @ nu[..., None])[..., 0]
-        P = symmetric(P - K @ T(PHt))
-        # (5) probabilities
-        fit = -0.5 * (nu * np.linalg.solve(C, nu[..., None])[..., 0]).sum(axis=2) - 0.5 * np.linalg.slogdet(C)[1]
-        mu = c * np.exp(np.maximum(fit - fit.max(axis=1, keepdims=True), -60.0))
-        mu = np.maximum(mu / mu.sum(axis=1, keepdims=True), 1e-9)
+    def predict(s: Hypotheses, at: Interval) -> Hypotheses:
+        centre = times(T(s.X), s.mu)  # where the Jacobian of all hypotheses is taken
+        c, w = mixing.ahead(s.mu, Pi)
+        X, P = mixing.mixture(w, s.X, s.P)
+        X, P = X * keep, P * (keep[:, :, None] * keep[:, None])
+        P[..., range(n_x, n_x + p), range(n_x, n_x + p)] += (w @ ~sets) * sets * s0**2  # of the faults that are new
+        F = ahead(np.concatenate([X, centre[:, None] + offsets], axis=1), at)
+        Phi = np.tile(np.eye(N), (len(c), 1, 1, 1))
+        Phi[:, 0, x] = T((F[:, L : L + N] - F[:, L + N :]) / (2 * width[:, None]))
+        X[..., x] = F[:, :L]
+        return Hypotheses(X, Phi @ P @ T(Phi) + Q, s.mu, c)
+
+    def update(s: Hypotheses, at: Interval, y: Array, seen: Array) -> Hypotheses:
+        n, m = len(y), len(sensors)
+        rows = np.repeat(np.arange(n), L)
+        X, P = s.X.reshape(-1, N), s.P.reshape(-1, N, N)
+        cross = P[..., x] @ H.T
+        nu = y[:, sensors][rows] - times(H, X[:, x])
+        done = correct(X, P, nu, cross, H @ cross[:, x] + R, seen[:, sensors][rows])
+        fit = log_likelihood(done.nu.reshape(n, L, m), done.S.reshape(n, L, m, m))
+        mu = mixing.weigh(s.c, fit, LEAST)
         mu = mu / mu.sum(axis=1, keepdims=True)
-        # verdict
-        limit = np.where(s.declared == 0, alarm, release)
-        candidate = np.where(mu[:, 0] > limit, 0, 1 + np.argmax(mu[:, 1:], axis=1))
-        count = np.where(candidate == s.candidate, s.times + 1, 1)
-        declared = np.where(count >= persist, candidate, s.declared)
-        return Bank(x, P, mu, declared, candidate, count)
+        return Hypotheses(done.x.reshape(n, L, N), done.P.reshape(n, L, N, N), mu, mu)
 
-    def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
-        k, s = state
-        y, u, _ = plant.split(obs)
-        n = len(obs)
-        if k > 0:
-            s = step(s, (k - 1) * plant.dt, u, y)
-        weight, b_all = s.mu[:, :, None], s.X[..., b_part]
-        b = (weight * b_all).sum(axis=1)
-        variance = np.einsum("nlbb->nlb", s.P[..., b_part, b_part]) + (b_all - b[:, None]) ** 2
-        std, probs = np.zeros((n, len(plant.estimated))), np.zeros((n, len(plant.labels)))
-        std[:, inputs.estimated] = np.sqrt((weight * variance).sum(axis=1))
+    def read(s: Hypotheses) -> Reading:
+        mean, P = mixing.mixture(s.mu[:, None], s.X, s.P)
+        mean, P = mean[:, 0], P[:, 0]
+        probs = np.zeros((len(mean), len(plant.labels)))
         probs[:, labels] = s.mu
-        theta = plant.estimate_target(inputs.theta(plant, b), u)
-        return (k + 1, s), Diagnosis(s.declared > 0, labels[s.declared], theta, std, probs)
+        reading = Reading(mean[:, b], P[:, b, b], mean[:, x], P[:, x, x], probs=probs)
+        return of_all_channels(plant, inputs, reading)
 
-    return Diagnoser(init, update)
+    def candidate(r: Reading, label: Array) -> Array:
+        assert r.probs is not None
+        limit = np.where(label == 0, alarm, release)
+        return np.where(r.probs[:, 0] > limit, 0, 1 + np.argmax(r.probs[:, 1:], axis=1))
+
+    return diagnoser_of(plant, Filter(start, predict, update, read, first_sample=False), by_candidate(candidate, persist))

@@ -109,9 +109,7 @@ def bank(b: Hypotheses) -> Filter:
         n = len(s.mu)
         c, w = mixing.ahead(s.mu, b.transition)
         X, P = mixing.mix(w, s.X, s.P, z, b.m0, b.M0)
-        X, P = model.predict(
-            extended, X.reshape(-1, N), P.reshape(-1, N, N), at.of(each(n)), np.tile(model.Q, (n, 1, 1))
-        )
+        X, P = model.predict(extended, X.reshape(-1, N), P.reshape(-1, N, N), at.of(each(n)), np.tile(model.Q, (n, 1, 1)))
         return Models(X.reshape(n, labels, N), P.reshape(n, labels, N, N), s.mu, c)
 
     def update(s: Models, at: Interval, y: Array, seen: Array) -> Models:

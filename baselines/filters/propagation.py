@@ -8,18 +8,15 @@ the whole batch of episodes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi_gym.diagnosis import NotApplicableError
+from fdi_gym.estimation.belief import FaultInputs
 from fdi_gym.estimation.kalman import T, symmetric
+from fdi_gym.estimation.sigma_points import INTERVAL, central_difference_moments, cholesky, spread
 from fdi_gym.plant import Array, Plant
-
-
-
-
 
 
 class Propagated(NamedTuple):
@@ -42,7 +39,7 @@ class Propagated(NamedTuple):
         return self.D if self.S is None else self.carry(np.tile(np.eye(self.D.shape[-1]), (len(self.D), 1, 1)))
 
 
-Rule = Callable[..., Propagated]  # rule(t, x (n, n_x), P (n, n_x, n_x), u (n, n_u), b (n, p), d (n, q))
+Propagation = Callable[..., Propagated]  # of (t, x (n, n_x), P (n, n_x, n_x), u (n, n_u), b (n, p), d (n, q))
 
 
 def _steps(plant: Plant, inputs: FaultInputs, ahead: int, step_b: float, step_d: float) -> tuple[Array, Array]:
@@ -63,28 +60,10 @@ def _differences(F: Array, ahead: int, p: int, q: int, step_b: float, step_d: fl
     return T(b[:, :p] - b[:, p:]) / (2 * step_b), T(d[:, :q] - d[:, q:]) / (2 * step_d)
 
 
-def central_difference_points(x: Array, S: Array, h: float) -> Array:
-    """x, x + h s_i, x - h s_i for the columns s_i of S: (n, 2 n_x + 1, n_x)."""
-    spread = h * T(S)
-    return np.concatenate([x[:, None], x[:, None] + spread, x[:, None] - spread], axis=1)
-
-
-def central_difference_moments(F: Array, h: float) -> tuple[Array, Array, Array]:
-    """Mean, spread D1 D1' + D2 D2' and D1 of the points' images F (n, 2 N + 1, n_x)."""
-    N = F.shape[1] // 2
-    centre, plus, minus = F[:, :1], F[:, 1 : N + 1], F[:, N + 1 :]
-    both = plus + minus
-    mean = (h**2 - N) / h**2 * centre[:, 0] + both.sum(axis=1) / (2 * h**2)
-    D1 = T(plus - minus) / (2 * h)
-    D2 = T(both - 2 * centre) * (np.sqrt(h**2 - 1) / (2 * h**2))
-    D = np.concatenate([D1, D2], axis=2)
-    return mean, D @ T(D), D1
-
-
-def central_difference_rule(
-    plant: Plant, inputs: FaultInputs, *, h: float = 3**0.5, step_b: float = 1e-3, step_d: float = 0.1
-) -> Rule:
-    """Second-order central differences with interval h (h^2 = kurtosis 3 of a Gaussian); A = D1 S^-1, P = S S'.
+def central_difference_propagation(
+    plant: Plant, inputs: FaultInputs, *, step_b: float = 1e-3, step_d: float = 0.1
+) -> Propagation:
+    """Second-order central differences of the state; A = D1 S^-1, P = S S'.
 
     Norgaard, Poulsen, Ravn, Automatica 36(11), 2000. B and E are plain central differences with the given steps.
     """
@@ -92,22 +71,22 @@ def central_difference_rule(
     ahead = 2 * n_x + 1
     step_theta, step_dist = _steps(plant, inputs, ahead, step_b, step_d)
 
-    def rule(t: Any, x: Array, P: Array, u: Array, b: Array, d: Array) -> Propagated:
-        S = np.linalg.cholesky(P)
+    def propagation(t: Any, x: Array, P: Array, u: Array, b: Array, d: Array) -> Propagated:
+        S = cholesky(P)
         points = np.empty((len(x), len(step_theta), n_x))
-        points[:, :ahead] = central_difference_points(x, S, h)
+        points[:, :ahead] = spread(x, S, INTERVAL)
         points[:, ahead:] = x[:, None]
         theta = inputs.theta(plant, b)[:, None] + step_theta
         F = plant.propagate(t, points, u, theta, d[:, None] + step_dist if q else None)
-        mean, Pf, D1 = central_difference_moments(F[:, :ahead], h)
+        mean, Pf, D1 = central_difference_moments(F[:, :ahead], INTERVAL)
         return Propagated(mean, Pf, D1, S, *_differences(F, ahead, p, q, step_b, step_d))
 
-    return rule
+    return propagation
 
 
-def extended_rule(
+def extended_propagation(
     plant: Plant, inputs: FaultInputs, *, step_x: float = 1e-5, step_b: float = 1e-5, step_d: float = 1e-3
-) -> Rule:
+) -> Propagation:
     """The mean goes through the plant, the spread through its Jacobian A P A'; central differences with these steps."""
     n_x, p, q = len(plant.states), len(inputs.entries), len(plant.disturbances)
     ahead = 2 * n_x + 1
@@ -115,19 +94,33 @@ def extended_rule(
     step_state = np.zeros((len(step_theta), n_x))
     step_state[1 : n_x + 1], step_state[n_x + 1 : ahead] = step_x * np.eye(n_x), -step_x * np.eye(n_x)
 
-    def rule(t: Any, x: Array, P: Array, u: Array, b: Array, d: Array) -> Propagated:
+    def propagation(t: Any, x: Array, P: Array, u: Array, b: Array, d: Array) -> Propagated:
         theta = inputs.theta(plant, b)[:, None] + step_theta
         F = plant.propagate(t, x[:, None] + step_state, u, theta, d[:, None] + step_dist if q else None)
         A = T(F[:, 1 : n_x + 1] - F[:, n_x + 1 : ahead]) / (2 * step_x)
         return Propagated(F[:, 0], symmetric(A @ P @ T(A)), A, None, *_differences(F, ahead, p, q, step_b, step_d))
 
-    return rule
+    return propagation
+
+
+PROPAGATIONS = {"central difference": central_difference_propagation, "extended": extended_propagation}
+
+
+def propagation_of(rule: str, plant: Plant, inputs: FaultInputs) -> Propagation:
+    """The rule by name.
+
+    Raises:
+        ValueError: Unknown name.
+    """
+    if rule not in PROPAGATIONS:
+        raise ValueError(f"unknown rule {rule!r}; there are {', '.join(PROPAGATIONS)}")
+    return PROPAGATIONS[rule](plant, inputs)
 
 
 def trim_model(plant: Plant, inputs: FaultInputs) -> Propagated:
     """The linearisation at trim: A (n_x, n_x), B (n_x, p), E (n_x, q), with the trim state after one sample as x."""
     n_x, zero = len(plant.states), np.zeros((1, len(inputs.entries)))
-    found = extended_rule(plant, inputs)(
+    found = extended_propagation(plant, inputs)(
         0.0, plant.trim_state[None], np.eye(n_x)[None], plant.trim_command[None], zero,
         np.zeros((1, len(plant.disturbances))),
     )  # fmt: skip

@@ -7,15 +7,26 @@ with all data since the alarm.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from baselines.filters.two_stage_kf import TwoStage, forget, prior, start, step
-from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
-from fdi_gym.estimation.decision import distance_logic, fit, manifolds
-from fdi_gym.estimation.linear import linear_model
+from baselines.filters.two_stage_kf import TwoStage, aging, decision_rule, initial_covariances, start, two_stage_filter
+from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
+from fdi_gym.diagnosis.contract import choose
+from fdi_gym.estimation.augmented import Interval
+from fdi_gym.estimation.decision import Reading, by_candidate
+from fdi_gym.estimation.labels import distances, manifolds
 from fdi_gym.plant import Array, Plant
+
+
+class Restarted(NamedTuple):
+    """State: both filters, the detector's decision, and whether it alarms (n,)."""
+
+    detector: TwoStage
+    second: TwoStage
+    decision: Any
+    alarm: Array
 
 
 @diagnoser("restart_kf", "Two-stage filter with forgetting as detector, restarted without it at the alarm")
@@ -28,41 +39,39 @@ def restart_kf(
         plant: A linear plant.
         factor: Forgetting factor of the detector.
         a_max: Cap of its covariance's eigenvalues.
-        threshold: Of its distance logic.
-        release_after: Of its distance logic, samples.
+        threshold: Of its distance to the labels.
+        release_after: Samples in a row with little evidence that give an alarm up.
 
     Raises:
         NotApplicableError: The plant is nonlinear.
     """
-    model, groups = linear_model(plant), manifolds(plant)
-    P_x, P_z = prior(plant)
-    logic = distance_logic(plant, threshold=threshold, release_after=release_after)
-    nominal = plant.nominal_theta
+    detector = two_stage_filter(plant, aging(plant, 0.0, "exponential", factor, 0.0, a_max))
+    second = two_stage_filter(plant, lambda Pz: Pz)
+    rule, groups = decision_rule(plant, "distance", threshold, release_after), manifolds(plant)
+    P_x, P_z = initial_covariances(plant)
 
-    def init(n: int) -> Any:
-        filters = [start(n, len(plant.outputs), P_x, P_z) for _ in range(2)]
-        return 0, *filters, logic.start(n), np.zeros(n, bool)
+    def begin(n: int) -> Restarted:
+        return Restarted(detector.start(n), second.start(n), rule.start(n), np.zeros(n, bool))
 
-    def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
-        k, detector, second, decided, alarm = state
-        n = len(obs)
-        if k == 0:
-            return (1, *state[1:]), Diagnosis(alarm, np.zeros(n, np.int64), np.tile(nominal, (n, 1)))
-        y, u, _ = plant.split(obs)
-        Pz = forget(detector.Pz, "exponential", factor, 0.0, a_max)
-        detector = step(detector, u, y, model, plant.Q, plant.R, Pz)
-        second = step(second, u, y, model, plant.Q, plant.R, second.Pz)
-        decided, said = logic.step(decided, k, detector.z, detector.Pz)
-        rises = said.alarm & ~alarm
+    def predict(s: Restarted, at: Interval) -> Restarted:
+        return s._replace(detector=detector.predict(s.detector, at), second=second.predict(s.second, at))
+
+    def update(s: Restarted, at: Interval, y: Array, seen: Array) -> Restarted:
+        first, other = (f.update(part, at, y, seen) for f, part in ((detector, s.detector), (second, s.second)))
+        decision, verdict = rule.step(s.decision, at.k, detector.read(first), np.asarray(seen.any(axis=1)))
+        rises = verdict.alarm & ~s.alarm
         if rises.any():
-            fresh = start(n, len(plant.outputs), P_x, P_z)._replace(x=detector.state(), Px=detector.covariance())
-            second = TwoStage(*(
-                np.where(rises.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-                for new, old in zip(fresh, second, strict=True)
-            ))  # fmt: skip
-        fits = fit(second.z, second.Pz, groups)
-        label = np.where(said.alarm, fits.labels[np.argmin(fits.J, axis=1)], 0)
-        z = np.where(said.alarm[:, None], second.z, 0.0)
-        return (k + 1, detector, second, decided, said.alarm), Diagnosis(said.alarm, label, nominal + z)
+            fresh = start(len(y), len(plant.outputs), P_x, P_z)._replace(x=first.state(), Px=first.covariance())
+            other = choose(rises, fresh, other)
+        return Restarted(first, other, decision, verdict.alarm)
 
-    return Diagnoser(init, update)
+    def read(s: Restarted) -> Reading:
+        fits = distances(s.second.z, s.second.Pz, groups)
+        cost = np.full((len(s.alarm), len(plant.labels)), np.inf)
+        cost[:, fits.labels] = np.where(s.alarm[:, None], fits.J, np.inf)
+        cost[:, 0] = np.where(s.alarm, np.inf, 0.0)
+        z, filter = np.where(s.alarm[:, None], s.second.z, 0.0), s.detector
+        return Reading(z, s.second.Pz, filter.state(), filter.covariance(), filter.nu, filter.S, filter.seen, cost)
+
+    filter = Filter(begin, predict, update, read, first_sample=False)
+    return diagnoser_of(plant, filter, by_candidate(lambda r, label: np.argmin(np.asarray(r.cost), axis=1), 1))

@@ -97,9 +97,7 @@ def two_stage_filter(model: AugmentedModel, first_sample: bool = True) -> Filter
         x = model.x
         return Reading(s.z, s.Pz, s.state()[:, x], s.covariance()[:, x, x], s.nu, s.S, s.seen)
 
-    return Filter(
-        start, predict, update, read, first_sample, expect=lambda s, at: model.expect(s.state()[:, model.x], at)
-    )
+    return Filter(start, predict, update, read, first_sample, expect=lambda s, at: model.expect(s.state()[:, model.x], at))
 
 
 @diagnoser("two_stage_ekf", "Two-stage extended Kalman filter, for any plant")

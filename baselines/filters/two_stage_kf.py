@@ -12,24 +12,19 @@ Equation numbers: A. Guven, C. Hajiyev, WSEAS Transactions on Signal Processing 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from fdi_gym.diagnosis import Diagnoser, diagnoser
-from fdi_gym.estimation.decision import (
-    Logic,
-    distance_logic,
-    penalty_logic,
-    persistence_logic,
-    surface_candidate,
-    with_logic,
-)
-from fdi_gym.estimation.kalman import T, right_divide, solve, symmetric, times
+from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
+from fdi_gym.estimation.calibration import Persistence, uniform
+from fdi_gym.estimation.decision import Reading, Rule, by_candidate, by_labels
+from fdi_gym.estimation.kalman import T, masked, right_divide, symmetric, times
 from fdi_gym.estimation.linear import LinearModel, linear_model
 from fdi_gym.plant import Array, Plant
 
+WARMUP = 150  # samples without a decision: the filter converges
 FORGETTING = ("none", "directional", "exponential")
 
 
@@ -43,6 +38,7 @@ class TwoStage(NamedTuple):
     V: Array  # (n, n_x, p) coupling
     nu: Array  # (n, n_y) innovation of the optimal filter
     S: Array  # (n, n_y, n_y) its covariance
+    seen: Array  # (n,) sensors in it
 
     def state(self) -> Array:
         """The optimal state estimate x + V z, eq. 40."""
@@ -58,7 +54,7 @@ def start(n: int, n_y: int, P_x: Array, P_z: Array) -> TwoStage:
     n_x, p = len(P_x), len(P_z)
     return TwoStage(
         np.zeros((n, n_x)), np.tile(P_x, (n, 1, 1)), np.zeros((n, p)), np.tile(P_z, (n, 1, 1)),
-        np.zeros((n, n_x, p)), np.zeros((n, n_y)), np.tile(np.eye(n_y), (n, 1, 1)),
+        np.zeros((n, n_x, p)), np.zeros((n, n_y)), np.tile(np.eye(n_y), (n, 1, 1)), np.zeros(n, np.int64),
     )  # fmt: skip
 
 
@@ -106,48 +102,102 @@ def aging(
     return aged
 
 
-def step(s: TwoStage, u: Array, y: Array, model: LinearModel, Q: Array, R: Array, Pz_minus: Array) -> TwoStage:
-    """One step with the command u_k (n, n_u) and the measurement y_{k+1} (n, n_y), eqs. 24 to 41."""
-    A, B, C = model.A, model.B, model.C
+def predict(s: TwoStage, u: Array, model: LinearModel, Q: Array, Pz_minus: Array) -> TwoStage:
+    """Over the interval under the command u_k (n, n_u), eqs. 24 to 31; Pz_minus (n, p, p) is the aged Pz."""
+    A = model.A
     W = A @ s.V + model.E(u)
     WPz = W @ s.Pz
     V = W if Pz_minus is s.Pz else right_divide(WPz, Pz_minus)
-    H = C @ V
-    x = times(A, s.x) + times(B, u) + times(W - V, s.z)
+    x = times(A, s.x) + times(model.B, u) + times(W - V, s.z)
     # W Pz W' - V Pz- V', with V Pz- = W Pz
     Px = symmetric(A @ s.Px @ A.T + Q + WPz @ T(W - V))
-    r = y - times(C, x)
-    CPx = C @ Px
-    S = CPx @ C.T + R
-    Kx = T(solve(S, CPx))
-    x = x + times(Kx, r)
-    Px = symmetric(Px - Kx @ CPx)
-    HPz = H @ Pz_minus
-    Sz = HPz @ T(H) + S
-    Kz = T(solve(Sz, HPz))
+    return s._replace(x=x, Px=Px, Pz=Pz_minus, V=V)
+
+
+def correct(s: TwoStage, y: Array, seen: Array, C: Array, R: Array) -> TwoStage:
+    """With the measurement y_{k+1} of the sensors that reported (n, n_y), eqs. 32 to 41."""
+    cross = s.Px @ C.T
+    r, S, cross, Ht = masked(seen, y - times(C, s.x), C @ cross + R, cross, T(C @ s.V))
+    H, Kx = T(Ht), right_divide(cross, S)
+    PzHt = s.Pz @ Ht
+    Sz = H @ PzHt + S
+    Kz = right_divide(PzHt, Sz)
     nu = r - times(H, s.z)
-    z = s.z + times(Kz, nu)
-    Pz = symmetric(Pz_minus - Kz @ HPz)
-    return TwoStage(x, Px, z, Pz, V - Kx @ H, nu, Sz)
+    return TwoStage(
+        s.x + times(Kx, r), symmetric(s.Px - Kx @ T(cross)), s.z + times(Kz, nu), symmetric(s.Pz - Kz @ T(PzHt)),
+        s.V - Kx @ H, nu, Sz, seen.sum(axis=1),
+    )  # fmt: skip
 
 
-def make_logic(plant: Plant, decision: str, threshold: float, release_after: int) -> Logic:
-    """The decision logic by name; for plants with simultaneous-fault labels always the penalty logic.
+def read(s: TwoStage) -> Reading:
+    """What the filter knows."""
+    return Reading(s.z, s.Pz, s.state(), s.covariance(), s.nu, s.S, s.seen)
+
+
+def two_stage_filter(plant: Plant, aged: Callable[[Array], Array]) -> Filter:
+    """The filter of a linear plant, with the time update `aged` of the fault parameter's covariance."""
+    model = linear_model(plant)
+    P_x, P_z = initial_covariances(plant)
+    return Filter(
+        lambda n: start(n, len(plant.outputs), P_x, P_z),
+        lambda s, at: predict(s, at.u, model, plant.Q, aged(s.Pz)),
+        lambda s, at, y, seen: correct(s, y, seen, model.C, plant.R),
+        read,
+        first_sample=False,
+    )
+
+
+def surface_candidate(
+    plant: Plant, position: Mapping[str, float], loss: float = 0.4, total: float = 0.8
+) -> Callable[[Reading, Array], Array]:
+    """Fixed thresholds on the effectiveness and position of each control surface.
+
+    The surface with the largest max(-gamma / loss, |b| / position) is faulty where that exceeds 1: stuck if
+    -gamma > total or |b| exceeds its position limit, else LOE. For plants whose estimate has the entries gamma_<surface>
+    and b_<surface> and whose modes are "<surface> LOE" and "<surface> stuck".
+    """
+    names = [s.name for s in plant.estimated]
+    gamma = [names.index(f"gamma_{surface}") for surface in position]
+    b = [names.index(f"b_{surface}") for surface in position]
+    limit = np.array(list(position.values()))
+    lost = np.array([plant.label_of(frozenset({f"{surface} LOE"})) for surface in position])
+    stuck = np.array([plant.label_of(frozenset({f"{surface} stuck"})) for surface in position])
+
+    def candidate(r: Reading, label: Array) -> Array:
+        assert r.z is not None
+        loss_of, place = -r.z[:, gamma], np.abs(r.z[:, b])
+        severity = np.maximum(loss_of / loss, place / limit)
+        s = np.argmax(severity, axis=1)
+        i = np.arange(len(r.z))
+        is_stuck = (loss_of[i, s] > total) | (place[i, s] > limit[s])
+        return np.where(severity[i, s] <= 1, 0, np.where(is_stuck, stuck[s], lost[s]))
+
+    return candidate
+
+
+def decision_rule(
+    plant: Plant, decision: str, threshold: float, release_after: int, position: Mapping[str, float] | None = None,
+    structured: bool = False,
+) -> Rule:  # fmt: skip
+    """The decision by name; with labels of simultaneous faults the threshold is a penalty per fault.
 
     Raises:
-        ValueError: Unknown name.
+        ValueError: Unknown name, or fixed thresholds without positions.
     """
     if decision == "thresholds":
-        return persistence_logic(plant, surface_candidate(plant, position={"aileron": 1.5, "rudder": 0.5}))
+        if not position:
+            raise ValueError(f"the decision 'thresholds' needs a position threshold for each surface of {plant.id}")
+        return by_candidate(surface_candidate(plant, position), 20, WARMUP)
     if decision != "distance":
         raise ValueError(f"unknown decision {decision!r}; there are distance, thresholds")
+    after = Persistence(5, 10, release_after, WARMUP)
     if any(len(label.modes) > 1 for label in plant.labels):
-        return penalty_logic(plant, penalty=threshold)
-    return distance_logic(plant, threshold=threshold, release_after=release_after)
+        after = Persistence(10, 10, 10, WARMUP, same=True)
+    return by_labels(plant, uniform(plant, threshold, after), on_line=structured)
 
 
-def prior(plant: Plant) -> tuple[Array, Array]:
-    """Initial covariances of state and fault parameter: 0.01 I, and 1 for an effectiveness, 4 for a position."""
+def initial_covariances(plant: Plant) -> tuple[Array, Array]:
+    """Of state and fault parameter: 0.01 I, and 1 for an effectiveness, 4 for a position."""
     return 0.01 * np.eye(len(plant.states)), np.diag([4.0 if s.unit else 1.0 for s in plant.theta])
 
 
@@ -170,6 +220,7 @@ def two_stage_kf(
     decision: str = "distance",
     threshold: float = 8.0,
     release_after: int = 50,
+    position: Mapping[str, float] | None = None,
     structured: bool = False,
 ) -> Diagnoser:
     """The two-stage Kalman filter with a decision logic.
@@ -184,6 +235,7 @@ def two_stage_kf(
         decision: "distance" or "thresholds" (fixed thresholds per surface).
         threshold: Of the distance logic; with simultaneous-fault labels the penalty per fault.
         release_after: Of the distance logic, samples.
+        position: Of the fixed thresholds: position of each surface that counts as stuck.
         structured: Report the magnitude of the declared fault in place of the free estimate.
 
     Raises:
@@ -191,11 +243,5 @@ def two_stage_kf(
         ValueError: Unknown forgetting rule or decision.
     """
     aged = aging(plant, q_bias, forgetting, factor, a_min, a_max)
-    model = linear_model(plant)
-    P_x, P_z = prior(plant)
-
-    def advance(s: TwoStage, u: Array, y: Array) -> TwoStage:
-        return step(s, u, y, model, plant.Q, plant.R, aged(s.Pz))
-
-    logic = make_logic(plant, decision, threshold, release_after)
-    return with_logic(plant, lambda n: start(n, len(plant.outputs), P_x, P_z), advance, logic, structured)
+    rule = decision_rule(plant, decision, threshold, release_after, position, structured)
+    return diagnoser_of(plant, two_stage_filter(plant, aged), rule)

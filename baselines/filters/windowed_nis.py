@@ -6,43 +6,43 @@ healthy; its sum over a window is tested against a quantile. It detects; it cann
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import scipy.linalg
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
-from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
-from fdi_gym.estimation.kalman import times
-from fdi_gym.estimation.linear import LinearModel, linear_model
+from baselines.filters import kalman_filter
+from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
+from fdi_gym.estimation.calibration import Persistence
+from fdi_gym.estimation.decision import Reading, Rule, Verdict, declare, undeclared
 from fdi_gym.plant import Array, Plant
 
 
-class SteadyFilter(NamedTuple):
-    """The fault-free Kalman filter in its steady state."""
-
-    model: LinearModel
-    K: Array  # gain (n_x, n_y)
-    S: Array  # innovation covariance (n_y, n_y)
-    W: Array  # its inverse
-
-    def step(self, x: Array, u: Array, y: Array) -> tuple[Array, Array]:
-        """(next estimate, innovation) from the estimate x_k (n, n_x), u_k (n, n_u), y_{k+1} (n, n_y)."""
-        predicted = times(self.model.A, x) + times(self.model.B, u)
-        nu = y - times(self.model.C, predicted)
-        return predicted + times(self.K, nu), nu
+def chi_square_quantile(confidence: float, freedoms: int) -> float:
+    """The quantile of the chi-square distribution."""
+    return 2.0 * float(gammaincinv(0.5 * freedoms, confidence))
 
 
-def steady_filter(plant: Plant) -> SteadyFilter:
-    """The steady filter of a linear plant, from the discrete algebraic Riccati equation.
+def window_rule(m: int, window: int, limit: float, alarm_after: int) -> Rule:
+    """The sum of the last `window` NIS values against a limit; a sensor that is missing counts with its expectation."""
+    after = Persistence(alarm_after, 1, 1)
 
-    Raises:
-        NotApplicableError: The plant is nonlinear.
-    """
-    model = linear_model(plant)
-    P = scipy.linalg.solve_discrete_are(model.A.T, model.C.T, plant.Q, plant.R)
-    S = model.C @ P @ model.C.T + plant.R
-    return SteadyFilter(model, np.linalg.solve(S, model.C @ P).T, S, np.linalg.inv(S))
+    def start(n: int) -> Any:
+        return np.zeros((n, window)), np.zeros(n, np.int64), undeclared(n)
+
+    def step(state: Any, k: Array, r: Reading, informed: Array) -> tuple[Any, Verdict]:
+        nis, count, declared = state
+        assert r.cost is not None
+        now = r.cost[:, 0]
+        rows = np.flatnonzero(informed)
+        nis = nis.copy()
+        nis[rows, count[rows] % window] = now[rows]
+        count = count + informed
+        exceeds = (nis.sum(axis=1) > limit) & (count >= window)
+        declared = declare(declared, np.ones(len(now), np.int64), exceeds, ~exceeds, after, informed)
+        return (nis, count, declared), Verdict(declared.label > 0, np.zeros(len(now), np.int64))
+
+    return Rule(start, step)
 
 
 @diagnoser("windowed_nis", "Windowed chi-square test on the innovations: detection only")
@@ -58,24 +58,22 @@ def windowed_nis(plant: Plant, *, window: int = 50, confidence: float = 0.9999, 
     Raises:
         NotApplicableError: The plant is nonlinear.
     """
-    nominal = steady_filter(plant)
-    limit = chi2.ppf(confidence, window * len(plant.outputs))
-    trim = plant.trim_state
+    f = kalman_filter.nominal_filter(plant)
+    m = len(f.R)
+    limit = chi_square_quantile(confidence, window * m)
 
-    def init(n: int) -> Any:
-        return 0, np.tile(trim, (n, 1)), np.zeros((n, window)), np.zeros(n, np.int64)
+    def start(n: int) -> tuple[kalman_filter.Healthy, Array]:
+        return kalman_filter.start(f, plant, n), np.zeros(n)
 
-    def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
-        k, x, nis, over = state
-        n = len(obs)
-        if k > 0:
-            y, u, _ = plant.split(obs)
-            x, nu = nominal.step(x, u, y)
-            nis = nis.copy()
-            nis[:, k % window] = (nu[:, None, :] @ nominal.W @ nu[:, :, None])[:, 0, 0]
-            exceeds = (nis.sum(axis=1) > limit) & (k >= window)
-            over = np.where(exceeds, over + 1, 0)
-        shown = {"windowed NIS": nis.sum(axis=1), "limit": np.full(n, limit)}
-        return (k + 1, x, nis, over), Diagnosis(over >= alarm_after, np.zeros(n, np.int64), signals=shown)
+    def update(state: Any, at: Any, y: Array, seen: Array) -> Any:
+        s = kalman_filter.correct(f, state[0], y, seen)
+        nis = (s.nu[:, None, :] @ s.W @ s.nu[:, :, None])[:, 0, 0]
+        return s, nis + (~seen).sum(axis=1)
 
-    return Diagnoser(init, update)
+    def read(state: Any) -> Reading:
+        s, nis = state
+        shown = {"NIS": nis, "limit of the mean": np.full(len(nis), limit / window)}
+        return Reading(x=s.x, Px=s.P, nu=s.nu, cost=nis[:, None], signals=shown)
+
+    filter = Filter(start, lambda s, at: (kalman_filter.predict(f, s[0], at.u), s[1]), update, read, first_sample=False)
+    return diagnoser_of(plant, filter, window_rule(m, window, limit, alarm_after))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from baselines.learned import network_module
-from fdi_gym.diagnosis import Diagnoser, Diagnosis, NotApplicableError, diagnoser, diagnosers, make_diagnoser, told
+from fdi_gym.diagnosis import Diagnoser, Diagnosis, NotApplicableError, diagnoser, diagnosers, make_diagnoser
 from fdi_gym.plant import Array, Plant
 from fdi_gym.training import trainer
 
@@ -56,9 +56,9 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
     for name in card.filters:  # never "module:function", which would be imported
         if name not in entries or entries[name].clairvoyant:
             raise weights.RefusedError(f"{file.with_suffix('.json')} names {name!r}, which is no filter that can be heard")
-    inputs = tensors["network.value.weight"].shape[1] if "network.value.weight" in tensors else 0
-    processes, direct = len(card.processes), tensors.get("network.direct.weight", np.zeros((0, 0)))
-    words = (direct.shape[-1] // processes,) if direct.size else ()
+    inputs, processes = weights.width_of(file, tensors, "network.value.weight"), len(card.processes)
+    direct = weights.width_of(file, tensors, "network.direct.weight") if "network.direct.weight" in tensors else 0
+    words = (direct // processes,) if direct else ()
     size = (inputs, len(plant.labels), len(plant.estimated), hidden, words, processes)
     net = network.SequenceNetwork(*size).double()
     sizes = {f"network.{name}": tuple(value.shape) for name, value in net.state_dict().items()}
@@ -70,7 +70,7 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
     scale, bias, prior = fitted.scale, np.array(fitted.bias), np.array(fitted.prior)
     healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
     unit = np.array([s.scale for s in plant.estimated])
-    heard = [make_diagnoser(name, plant, **told(name, expected)) for name in card.filters]
+    heard = [make_diagnoser(name, plant, process=expected) for name in card.filters]
 
     def init(n: int) -> Any:
         said = Diagnosis(np.zeros(n, bool), np.zeros(n, np.int64), np.tile(healthy, (n, 1)), np.tile(unit, (n, 1)),

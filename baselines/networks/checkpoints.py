@@ -14,7 +14,7 @@ from safetensors import safe_open
 from safetensors.numpy import save
 
 from baselines.networks import weights
-from fdi_gym.evaluation import write_whole
+from fdi_gym.files import write_whole
 from fdi_gym.plant import Array, Plant
 
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of Adam

@@ -11,7 +11,7 @@ import numpy as np
 
 from baselines.networks import identification as ident
 from baselines.networks.identification import Model, Shape
-from fdi_gym.diagnosis import Diagnosis, make_diagnoser, run, told
+from fdi_gym.diagnosis import Diagnosis, make_diagnoser, run
 from fdi_gym.faults import draw
 from fdi_gym.metrics import balanced_accuracy, scored_samples
 from fdi_gym.plant import Array, Plant, PlantSource, add_plant_source, load_plant, plant_sources
@@ -141,7 +141,7 @@ def _elsewhere(known: PlantSource, plant_id: str, *arguments: Any) -> list[Array
 
 
 def _words(plant: Plant, source: Source, name: str, obs: Array, period: int) -> Array:
-    said = run(make_diagnoser(name, plant, **told(name, source.process)), obs, signals=True)
+    said = run(make_diagnoser(name, plant, process=source.process), obs, signals=True)
     parts = [getattr(said, name) for name in ("alarm", "label", "estimate", "estimate_std", "label_probs")]
     n, samples = said.label.shape
     steps = samples // period

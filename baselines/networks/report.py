@@ -12,8 +12,10 @@ from typing import Any
 
 from baselines.networks import weights
 from baselines.networks.weights import Card
-from fdi_gym.evaluation import Row, suite_names, write_whole
-from fdi_gym.leaderboard import markdown, read_row
+from fdi_gym.files import write_whole
+from fdi_gym.leaderboard import clairvoyant, markdown, read_rows
+from fdi_gym.row import Row
+from fdi_gym.suite import suite_names
 
 HOME = Path(__file__).parent.parent.parent / "leaderboards"
 LEARNED = ("sequence_net", "residual_net", "ppo", "ppo_identification")
@@ -37,11 +39,7 @@ def best(rows: list[Row]) -> Row | None:
 
 def rows_of(suite: str) -> dict[str, Row]:
     """A suite's rows by diagnoser."""
-    return {row.diagnoser: row for row in map(read_row, _files(suite))}
-
-
-def _files(suite: str) -> list[Path]:
-    return [path for path in sorted((HOME / "results" / suite).glob("*.json")) if path.name != "timing.json"]
+    return {row.diagnoser: row for row in read_rows(HOME / "results" / suite)}
 
 
 def verdict(row: Row, other: Row | None) -> str:
@@ -58,11 +56,11 @@ def accuracy_table() -> str:
     lines = []
     for suite in suite_names():
         rows = rows_of(suite)
-        filters = [r for r in rows.values() if not r.clairvoyant and r.diagnoser not in (*LEARNED, *FLOOR)]
+        filters = [r for r in rows.values() if not clairvoyant(r) and r.diagnoser not in (*LEARNED, *FLOOR)]
         paper = best([r for r in filters if r.diagnoser not in REFERENCE])
         bank, oracle = (
             best([r for r in filters if r.diagnoser in REFERENCE]),
-            best([r for r in rows.values() if r.clairvoyant]),
+            best([r for r in rows.values() if clairvoyant(r)]),
         )
         for name in LEARNED:
             if name in rows and name != "ppo_identification":

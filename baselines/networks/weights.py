@@ -10,7 +10,7 @@ import hashlib
 import subprocess
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -18,14 +18,15 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from baselines.networks.identification import Shape
-from fdi_gym.evaluation import write_whole
+from fdi_gym.files import RefusedError, read_bytes, read_json, write_whole
 from fdi_gym.plant import Array, Plant
 
 WEIGHTS = Path(__file__).parent.parent / "learned" / "weights"
 
 
-class RefusedError(ValueError):
-    """Weights that are not what they should be; the message says why."""
+# upper ends of what a card may ask for, so that no card makes the building of a network take all memory
+SIZES = {"stride": 1000, "lags": 1000, "degree": 3, "effects": 3, "every": 1000, "hidden": 1024}
+LARGEST, LARGEST_CARD = 2**28, 2**20  # bytes
 
 
 class WrongPlantError(RefusedError):
@@ -39,6 +40,9 @@ class Fitted(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         scale, bias: Of the logits; one bias per label.
         prior: Share of each label in training flights.
         log_score, calibration_error: On the validation flights, with the prior alone and calibrated.
+
+    Raises:
+        ValueError: A number out of range.
     """
 
     scale: float
@@ -46,6 +50,12 @@ class Fitted(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     prior: list[float]
     log_score: tuple[float, float]
     calibration_error: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        if not 0 < self.scale < 1e6 or any(abs(value) > 1e6 for value in self.bias):
+            raise ValueError("a calibration's scale is above 0, and its numbers are below a million")
+        if any(not 0 <= value <= 1 for value in self.prior) or not sum(self.prior) > 0:
+            raise ValueError("a calibration's prior is made of shares from 0 to 1")
 
 
 class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -69,9 +79,12 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         revision: Git revision of the code, or "".
         versions: Of the libraries.
         sha256: Digest of the weight file.
+
+    Raises:
+        ValueError: No process, or more filters than any network hears.
     """
 
-    schema: int = 1
+    schema: Literal[1] = 1
     method: str
     env: str
     plant: str
@@ -91,6 +104,12 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     revision: str
     versions: dict[str, str]
     sha256: str = ""
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.processes) <= 100 or len(set(self.processes)) < len(self.processes):
+            raise ValueError("weights are for 1 to 100 different processes")
+        if len(self.filters) > 16:
+            raise ValueError("a network hears up to 16 filters")
 
 
 def names(plant: Plant) -> dict[str, list[str]]:
@@ -123,19 +142,28 @@ def read_tensors(path: Path) -> dict[str, Array]:
     """The tensors of a safetensors file.
 
     Raises:
-        RefusedError: Another kind of file, or a value that is not finite.
+        RefusedError: Another kind of file, or a value that is not a finite floating-point number.
     """
+    return _tensors(path, _content(path))
+
+
+def _content(path: Path) -> bytes:
     if path.suffix != ".safetensors":
         raise RefusedError(f"{path}: weights are .safetensors files, not {path.suffix or 'without a suffix'}")
-    content = path.read_bytes()
+    return read_bytes(path, LARGEST)
+
+
+def _tensors(path: Path, content: bytes) -> dict[str, Array]:
     for magic, what in ((b"\x80", "a pickle"), (b"PK", "a zip archive (torch or stable-baselines3)")):
         if content.startswith(magic) and not content[8:9] == b"{":
             raise RefusedError(f"{path} is {what}, which can run code when it is read; weights are safetensors")
     try:
         tensors = load(content)
-    except SafetensorError as error:
+    except (SafetensorError, ValueError, TypeError, KeyError, OverflowError) as error:
         raise RefusedError(f"{path} is not a safetensors file: {error}") from error
     for name, value in tensors.items():
+        if value.dtype.kind != "f":
+            raise RefusedError(f"{path}: {name} is made of {value.dtype}, not of floating-point numbers")
         if not np.isfinite(value).all():
             raise RefusedError(f"{path}: {name} holds values that are not finite")
     return tensors
@@ -148,9 +176,9 @@ def read_card(path: Path) -> Card:
         RefusedError: There is none, or it is not a card.
     """
     try:
-        return msgspec.json.decode(path.with_suffix(".json").read_bytes(), type=Card)
-    except (OSError, msgspec.DecodeError) as error:
-        raise RefusedError(f"{path.with_suffix('.json')} is not a card: {error}") from error
+        return read_json(path.with_suffix(".json"), Card, "card", LARGEST_CARD)
+    except OSError as error:
+        raise RefusedError(f"{path.with_suffix('.json')} is not a card: {error.strerror}") from error
 
 
 def read(path: Path, plant: Plant) -> tuple[dict[str, Array], Card]:
@@ -160,8 +188,9 @@ def read(path: Path, plant: Plant) -> tuple[dict[str, Array], Card]:
         RefusedError: The file, the card, or the two together are not what they should be; `WrongPlantError` where they
             are, but for another plant.
     """
-    tensors, card = read_tensors(path), read_card(path)
-    if hashlib.sha256(path.read_bytes()).hexdigest() != card.sha256:
+    content = _content(path)
+    tensors, card = _tensors(path, content), read_card(path)
+    if hashlib.sha256(content).hexdigest() != card.sha256:
         raise RefusedError(f"{path}: the card belongs to another file: the digest differs")
     if card.env != plant.env_id:
         raise WrongPlantError(f"{path.name} was trained for {card.env}, not for {plant.env_id}")
@@ -177,13 +206,14 @@ def shape_of(path: Path, card: Card) -> tuple[Shape, int]:
     """The shape of the identified model and the width of the layers, as the card gives them.
 
     Raises:
-        RefusedError: One is missing, or not a whole number above 0.
+        RefusedError: One is missing, or not a whole number above 0 and up to its upper end.
     """
     sizes: dict[str, int] = {}
     for name in (*Shape._fields, "hidden"):
         value = card.shape.get(name, Shape._field_defaults.get(name))
-        if not isinstance(value, int) or value < 1:
-            raise RefusedError(f"{path.with_suffix('.json')}: the shape's {name} is a whole number above 0, not {value!r}")
+        if type(value) is not int or not 1 <= value <= SIZES[name]:
+            what = f"a whole number above 0, up to {SIZES[name]}"
+            raise RefusedError(f"{path.with_suffix('.json')}: the shape's {name} is {what}, not {str(value)[:80]!r}")
         sizes[name] = value
     hidden = sizes.pop("hidden")
     return Shape(**sizes), hidden
@@ -196,9 +226,20 @@ def fitted_of(path: Path, card: Card, process: str) -> Fitted:
         RefusedError: There is none, or not one entry per label.
     """
     found = card.calibration.get(process)
-    if found is None or not len(found.bias) == len(found.prior) == len(card.labels) or not sum(found.prior) > 0:
+    if found is None or not len(found.bias) == len(found.prior) == len(card.labels):
         raise RefusedError(f"{path.with_suffix('.json')} has no calibration of {len(card.labels)} labels for {process!r}")
     return found
+
+
+def width_of(path: Path, tensors: dict[str, Array], name: str) -> int:
+    """How many columns a weight matrix has.
+
+    Raises:
+        RefusedError: There is no such matrix.
+    """
+    if name not in tensors or tensors[name].ndim != 2:
+        raise RefusedError(f"{path} lacks the matrix {name}")
+    return tensors[name].shape[1]
 
 
 def check_tensors(path: Path, tensors: dict[str, Array], expected: dict[str, tuple[int, ...]]) -> None:

@@ -10,14 +10,16 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import tyro
 
 from baselines.reproduction.consistency import FILTERS, measure
 from baselines.reproduction.tables import markdown, pieces
 from fdi_gym.diagnosis import diagnosers
-from fdi_gym.evaluation import Row, Suite, applicable, evaluate, load_suite
-from fdi_gym.leaderboard import read_row, row_path, write_rows
+from fdi_gym.evaluation import applicable, evaluate
+from fdi_gym.files import pretty, read_json, write_whole
+from fdi_gym.leaderboard import clairvoyant, plain, read_rows
+from fdi_gym.row import Row, row_path, write_rows
+from fdi_gym.suite import Suite, load_suite
 
 KINDS = ("standard", "hard")
 # the filters of the paper that each plant was taken from
@@ -56,7 +58,7 @@ class Arguments:
 
 def consistency_piece(suite: Suite, name: str) -> dict[str, Any]:
     """NIS and NEES of one filter on one suite's plant and process."""
-    return measure(suite.build(), suite.scenario, name)
+    return measure(suite.build(), suite.process, name)
 
 
 def reasons_of(suite: Suite) -> dict[str, str]:
@@ -73,8 +75,8 @@ def run(arguments: Arguments) -> dict[str, Any]:
             if name in reasons[suite.name] or row_path(arguments.results, suite.name, name).exists():
                 continue
             command = f"fdi-gym evaluate {suite.name} --diagnosers {name}"
-            rows, timing = evaluate(suite, [name], work=arguments.work, jobs=arguments.jobs, command=command)
-            write_rows(arguments.results, suite, rows, timing)
+            found = evaluate(suite, [name], work=arguments.work, jobs=arguments.jobs, command=command)
+            write_rows(arguments.results, suite, found)
     jobs: dict[str, Any] = {f"{s.name}.{name}": (consistency_piece, (s, name))
                             for s in suites for name in FILTERS if name not in reasons[s.name]}  # fmt: skip
     return {"consistency": pieces(arguments.work / "consistency", jobs, arguments.jobs), "reasons": reasons}
@@ -97,10 +99,7 @@ def cell(row: Row | None) -> str:
 
 def rows_of(results: Path, suite: str) -> dict[str, Row]:
     """The rows of a suite."""
-    return {
-        row.diagnoser: row for path in sorted((results / suite).glob("*.json")) if path.name != "timing.json"
-        for row in [read_row(path)]
-    }  # fmt: skip
+    return {row.diagnoser: row for row in read_rows(results / suite)}
 
 
 def table(found: dict[str, dict[str, Row]]) -> str:
@@ -111,12 +110,11 @@ def table(found: dict[str, dict[str, Row]]) -> str:
         mine = [accuracy(rows[name])[0] for rows in found.values() if name in rows]
         return -len(mine), -sum(mine) / len(mine), name
 
-    entries = diagnosers()
     head = ["method", *found]
     body = []
     for name in sorted(names, key=order):
-        star = " *" if name in entries and entries[name].clairvoyant else ""
-        body.append([name + star, *(cell(rows.get(name)) for rows in found.values())])
+        star = " *" if any(clairvoyant(rows[name]) for rows in found.values() if name in rows) else ""
+        body.append([plain(name) + star, *(cell(rows.get(name)) for rows in found.values())])
     return markdown(head, body)
 
 
@@ -124,16 +122,18 @@ def winners(found: dict[str, dict[str, Row]]) -> str:
     """Which method wins where, and by how much the paper's own filter is beaten on its own plant."""
     body = []
     for suite, rows in found.items():
-        honest = {n: accuracy(r) for n, r in rows.items() if not r.clairvoyant}
+        honest = {n: accuracy(r) for n, r in rows.items() if not clairvoyant(r)}
         paper = {n: honest[n] for n in PAPER[suite.split("-")[0]] if n in honest}
-        oracle = max((accuracy(r)[0] for r in rows.values() if r.clairvoyant), default=float("nan"))
+        if not paper:
+            continue
+        oracle = max((accuracy(r)[0] for r in rows.values() if clairvoyant(r)), default=None)
         best, own = max(honest, key=lambda n: honest[n][0]), max(paper, key=lambda n: paper[n][0])
         apart = honest[best][1] > paper[own][2]
         ahead = honest[best][0] - paper[own][0]
         body.append([
             suite, f"{best} {cell(rows[best])}", f"{own} {cell(rows[own])}",
             "its own wins" if best == own else f"{ahead:.1f} points, intervals {'apart' if apart else 'overlap'}",
-            f"{oracle:.1f}",
+            "-" if oracle is None else f"{oracle:.1f}",
         ])  # fmt: skip
     return markdown(["suite", "best method", "best filter of the plant's paper", "beaten by", "best oracle"], body)
 
@@ -143,7 +143,7 @@ def reasons_table(found: dict[str, dict[str, str]]) -> str:
     said: dict[tuple[str, str], set[str]] = {}
     for suite, why in found.items():
         for name, reason in why.items():
-            said.setdefault((suite.split("-")[0], reason), set()).add(name)
+            said.setdefault((suite.split("-")[0], plain(reason)), set()).add(name)
     body = [[family, ", ".join(sorted(names)), reason] for (family, reason), names in sorted(said.items())]
     return markdown(["plant", "methods", "reason"], body)
 
@@ -187,12 +187,12 @@ def page(results: Path, figures: dict[str, Any]) -> str:
 def main(arguments: Arguments) -> None:
     """Fill the grid and write its page."""
     kept = arguments.page.with_name("grid.json")
-    figures = msgspec.json.decode(kept.read_bytes()) if kept.exists() else {}
+    figures = read_json(kept, dict[str, Any], "grid's figures") if kept.exists() else {}
     if not arguments.page_only:
         for part, found in run(arguments).items():
             figures[part] = {**figures.get(part, {}), **found}
-        kept.write_bytes(msgspec.json.format(msgspec.json.encode(figures, order="deterministic"), indent=2) + b"\n")
-    arguments.page.write_text(page(arguments.results, figures))
+        write_whole(kept, pretty(figures))
+    write_whole(arguments.page, page(arguments.results, figures).encode())
     print(arguments.page)
 
 

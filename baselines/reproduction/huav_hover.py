@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 import tyro
+from fdi_gym.estimation.flags import label_sets
+from fdi_gym.estimation.propagation import fault_inputs
 
 from baselines.filters.flag_thresholds import calibrate
 from baselines.filters.matched_oracle import steady_filter
@@ -28,8 +30,6 @@ from baselines.reproduction.huav_reference import (
 )
 from baselines.reproduction.tables import markdown, pieces
 from fdi_gym.diagnosis import Diagnoser, find_diagnoser, guarded
-from fdi_gym.estimation.flags import label_sets
-from fdi_gym.estimation.propagation import fault_inputs
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant, load_plant
 from fdi_gym.plants.huav_hover import CHANNELS, ID, disturbance_rows, episode, fault_free_episode, paper

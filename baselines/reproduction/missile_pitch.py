@@ -17,8 +17,8 @@ import numpy as np
 import tyro
 
 from baselines.filters import approximation_detector as detection
-from baselines.filters import augmented_ekf_bank as ekf_bank
 from baselines.filters import generalised_observer_scheme as isolation
+from baselines.filters import missile_model as model
 from baselines.reproduction import missile_reference as reference
 from baselines.reproduction.missile_page import (
     BATCH,
@@ -31,7 +31,6 @@ from baselines.reproduction.missile_page import (
 )
 from baselines.reproduction.tables import markdown, pieces
 from fdi_gym.diagnosis import make_diagnoser, run
-from fdi_gym.estimation import missile_model as model
 from fdi_gym.faults import FaultScenario, Incipient, draw
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants import missile_pitch as missile
@@ -59,26 +58,19 @@ class Arguments:
 # What is watched
 
 
-def adaptive_bank(plant: Plant, obs: Array, classes: Sequence[int], sigma: Array | None = None) -> dict[str, Array]:
+def adaptive_bank(plant: Plant, obs: Array, classes: tuple[int, ...]) -> dict[str, Array]:
     """Detector and isolation bank at every sample, arrays with the samples along the second axis."""
-    classes = tuple(classes)
-    sigma = detection.sensor_sigma(plant) if sigma is None else sigma
-    detector, bank = detection.start(len(obs)), isolation.start(len(obs), len(classes))
-    rows: dict[str, list[Array]] = {}
-    for k in range(obs.shape[1]):
-        sample = model.read(plant, obs[:, k])
-        detector = detection.advance(detector, sample, sigma)
-        bank = isolation.advance(bank, detector, sample, classes)
-        shown = {
-            "alarm": detector.alarm, "ratio": (np.abs(detector.eps) / detector.threshold).max(axis=1),
-            "ratio_q": np.abs(detector.eps[:, 1]) / detector.threshold[:, 1],
-            "eps": detector.eps[:, 1], "threshold": detector.threshold[:, 1], "fhat": detector.fhat,
-            "residual": bank.eps[..., 1], "lambda": bank.threshold[..., 1], "theta": bank.used, "excluded": bank.excluded,
-            "strict": isolation.strict_verdict(bank, classes), "tie_broken": isolation.tie_broken(bank, classes),
-        }  # fmt: skip
-        for name, value in shown.items():
-            rows.setdefault(name, []).append(value)
-    return {name: np.stack(values, axis=1) for name, values in rows.items()}
+    said = run(isolation.gos(plant, classes=classes), obs, signals=True)
+    shown = said.signals or {}
+    eps, threshold, excluded, begun = (shown[name] for name in ("residual", "threshold", "excluded", "isolating"))
+    ratio = np.abs(eps) / threshold
+    return {
+        "alarm": said.alarm, "ratio": ratio.max(axis=2), "ratio_q": ratio[..., 1], "eps": eps[..., 1],
+        "threshold": threshold[..., 1], "fhat": shown["fault function"], "residual": shown["isolation residuals"][..., 1],
+        "lambda": shown["isolation thresholds"][..., 1], "theta": shown["parameters"], "excluded": excluded.astype(bool),
+        "strict": isolation.strict_verdict(begun > 0, excluded > 0, classes),
+        "tie_broken": isolation.tie_broken(begun > 0, excluded > 0, shown["energy"], classes),
+    }  # fmt: skip
 
 
 def first(condition: Array) -> list[float]:
@@ -187,13 +179,10 @@ def fault_free(runs: int) -> dict[str, Any]:
     obs = simulate(plant, [s.without_faults() for s, _ in flights], [noise for _, noise in flights]).obs
     found = adaptive_bank(plant, obs, FIVE)
     bare = run(make_diagnoser("approximation_detector_no_margin", plant), obs)
-    bank = ekf_bank.augmented_ekf_bank(plant)
-    state, largest, alarm = bank.init(runs), -np.inf, np.zeros(runs, bool)
-    for k in range(obs.shape[1]):
-        state, said = bank.update(state, obs[:, k])
-        largest, alarm = max(largest, float(state[1].llr.max())), said.alarm
+    bank = run(make_diagnoser("augmented_ekf_bank", plant), obs, signals=True)
+    largest = float((bank.signals or {})["log-likelihood ratios"].max())
     return {
-        "runs": runs, "detector": int(found["alarm"][:, -1].sum()), "bank": int(alarm.sum()),
+        "runs": runs, "detector": int(found["alarm"][:, -1].sum()), "bank": int(bank.alarm[:, -1].sum()),
         "bare": int(bare.alarm[:, -1].sum()), "ratio": float(found["ratio"].max()), "llr": largest,
     }  # fmt: skip
 
@@ -225,14 +214,8 @@ def randomised(first_seed: int, runs: int, noise_scale: float = 1.0, fault_scale
         return [mode[rows, k].astype(int).tolist() for k in times]
 
     five, two = adaptive_bank(plant, flown.obs, FIVE), adaptive_bank(plant, flown.obs, (1, 2))
-    bank = ekf_bank.augmented_ekf_bank(plant)
-    state, modes, alarms = bank.init(runs), [], []
-    for k in range(flown.obs.shape[1]):
-        state, said = bank.update(state, flown.obs[:, k])
-        modes.append(said.label)
-        alarms.append(said.alarm)
+    bank = run(make_diagnoser("augmented_ekf_bank", plant), flown.obs, signals=True)
     known = run(make_diagnoser("innovation_oracle", plant, scenarios=scenarios), flown.obs)
-    alarms = np.stack(alarms, axis=1)
     true = np.maximum(label, 1)
     truth = flown.theta[rows, -1, true - 1]
     eta = flown.obs[..., 2] - np.stack([v[:, 2] for _, v in noise])
@@ -240,12 +223,12 @@ def randomised(first_seed: int, runs: int, noise_scale: float = 1.0, fault_scale
     after = np.arange(2001)[None, :] >= onset[:, None]
     return {
         "label": label.tolist(), "onset": onset.tolist(), "terminated": int(flown.terminated.sum()),
-        "gos": at(five["tie_broken"]), "augmented_ekf_bank": at(np.stack(modes, axis=1)),
+        "gos": at(five["tie_broken"]), "augmented_ekf_bank": at(bank.label),
         "innovation_oracle": at(known.label),
         "strict five": at(five["strict"]), "strict two": at(two["strict"]), "two": at(two["tie_broken"]),
         "excluded": five["excluded"][:, -1].astype(int).tolist(),
-        "detector alarm": first(five["alarm"]), "bank alarm": first(alarms),
-        "truth": truth.tolist(), "ekf theta": state[0].z[rows, true, 2].tolist(),
+        "detector alarm": first(five["alarm"]), "bank alarm": first(bank.alarm),
+        "truth": truth.tolist(), "ekf theta": (bank.signals or {})["fault parameters"][rows, -1, true - 1].tolist(),
         "gos theta": five["theta"][rows, -1, true - 1].tolist(),
         "largest": [float(np.abs(a).max()) for a in
                     (flown.state[..., 0] / missile.DEG, flown.state[..., 1], eta, flown.state[..., 2] / missile.DEG)],

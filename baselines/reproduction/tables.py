@@ -11,7 +11,7 @@ import joblib
 import msgspec
 from tqdm import tqdm
 
-from fdi_gym.evaluation import write_whole
+from fdi_gym.files import write_whole
 from fdi_gym.leaderboard import markdown
 
 __all__ = ["compared", "markdown", "pieces"]

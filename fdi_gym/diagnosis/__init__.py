@@ -2,12 +2,12 @@
 
 from fdi_gym.diagnosis.contract import Decisions, Diagnoser, Diagnosis, run
 from fdi_gym.diagnosis.filtering import Filter, diagnoser_of
-from fdi_gym.diagnosis.fit import fit
+from fdi_gym.diagnosis.fitting import fit
 from fdi_gym.diagnosis.guard import guarded
-from fdi_gym.diagnosis.registry import Entry, diagnoser, diagnosers, find_diagnoser, make_diagnoser
+from fdi_gym.diagnosis.registry import Entry, broken_plugins, diagnoser, diagnosers, find_diagnoser, make_diagnoser
 from fdi_gym.plant import NotApplicableError
 
 __all__ = [
     "Decisions", "Diagnoser", "Diagnosis", "Entry", "Filter", "NotApplicableError",
-    "diagnoser", "diagnoser_of", "diagnosers", "find_diagnoser", "fit", "guarded", "make_diagnoser", "run",
+    "broken_plugins", "diagnoser", "diagnoser_of", "diagnosers", "find_diagnoser", "fit", "guarded", "make_diagnoser", "run",
 ]  # fmt: skip

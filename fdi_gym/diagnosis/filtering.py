@@ -59,10 +59,10 @@ def _step(plant: Plant, filter: Filter, rule: Rule, s: Running, obs: Array) -> t
     y, u, known = plant.split(obs)
     seen = np.isfinite(y)
     whole = bool(seen.all())
-    if not np.isfinite(u).all():
-        u = np.where(np.isfinite(u), u, s.u)
-    if not np.isfinite(known).all():
-        known = np.where(np.isfinite(known), known, s.known)
+    held: Array | None = None
+    if not (np.isfinite(u).all() and np.isfinite(known).all()):
+        held = np.any(~np.isfinite(np.concatenate([u, known], axis=1)), axis=1)
+        u, known = np.where(np.isfinite(u), u, s.u), np.where(np.isfinite(known), known, s.known)
     if not whole:
         y = np.where(seen, y, 0.0)
     first = s.k == 0
@@ -70,7 +70,7 @@ def _step(plant: Plant, filter: Filter, rule: Rule, s: Running, obs: Array) -> t
     if plant.measured_disturbance is not None:
         before = np.where(first[:, None], known, s.known)
         d = plant.measured_disturbance((s.k - 1) * plant.dt, before, known)  # type: ignore[arg-type]
-    at = Interval(s.k, u, d, known)
+    at = Interval(s.k, u, d, known, held)
     state, begun = s.filter, s.begun
     ready = begun & ~first
     if ready.all():
@@ -91,7 +91,7 @@ def _step(plant: Plant, filter: Filter, rule: Rule, s: Running, obs: Array) -> t
     elif measures.any():
         state = choose(measures, filter.update(state, at, y, seen), state)
     reading = filter.read(state)
-    informed = measures if whole else measures & seen.any(axis=1)
+    informed = measures if whole else measures & (seen.any(axis=1) if reading.seen is None else reading.seen > 0)
     ruled, verdict = rule.step(s.rule, s.k, reading, informed)
     return Running(s.k + 1, begun, u, known, state, ruled), reading, verdict
 
@@ -103,14 +103,16 @@ def diagnoser_of(plant: Plant, filter: Filter, rule: Rule) -> Diagnoser:
     def update(s: Running, obs: Array) -> tuple[Running, Diagnosis]:
         s, r, verdict = _step(plant, filter, rule, s, obs)
         z = r.z if verdict.z is None else verdict.z
-        std = None if r.P is None else np.sqrt(np.maximum(np.einsum("npp->np", r.P), 0.0))
+        P = r.P if verdict.P is None else verdict.P
+        std = None if P is None else np.sqrt(np.maximum(np.einsum("npp->np", P), 0.0))
         estimate = None if z is None else healthy + z
-        return s, Diagnosis(verdict.alarm, verdict.label, estimate, std, r.probs, r.x, r.signals)
+        signals = {**(r.signals or {}), **(verdict.signals or {})}
+        return s, Diagnosis(verdict.alarm, verdict.label, estimate, std, r.probs, r.x, signals or None)
 
     return Diagnoser(lambda n: _start(plant, filter, rule, n), update, gaps=True, filter=filter, rule=rule)
 
 
-def watch(plant: Plant, diagnoser: Diagnoser, obs: Array) -> Iterator[tuple[Reading, Verdict]]:
+def readings(plant: Plant, diagnoser: Diagnoser, obs: Array) -> Iterator[tuple[Reading, Verdict]]:
     """What the filter and the rule of a diagnoser say at each sample of recorded observations (N, K + 1, n_obs)."""
     s = _start(plant, diagnoser.filter, diagnoser.rule, len(obs))
     for k in range(obs.shape[1]):

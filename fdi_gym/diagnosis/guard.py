@@ -73,7 +73,7 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
 
     A method that does not handle gaps is not shown a sample with a missing value: its diagnosis stands. An episode whose
     diagnosis is `invalid`, or whose update fails in linear algebra, is lost: label -1, which is never right, no alarm,
-    estimate and state NaN, no probability for any label, from there to its end. The other episodes of the batch are not touched.
+    estimate and state NaN, no probability for any label, from there to its end. The other episodes are not touched.
 
     Raises (from update):
         ValueError: obs has the wrong shape, or the diagnoser's answer does.

@@ -8,14 +8,13 @@ A builder makes a diagnoser from a plant and from data; it flies nothing and rea
     @diagnoser("augmented_ekf", "Augmented extended Kalman filter")
     def augmented_ekf(plant: Plant, belief: Belief, calibration: Calibration, *, walk: float = 1.0) -> Diagnoser: ...
 
-Arguments of these names are given: `belief` and `calibration` are what `fdi_gym.diagnosis.fit` found for the fault process
-that will be met, `process` is that process's name, `scenarios` the truth, for ceilings only. All others are tuning. Builders
-in the modules and packages of the entry-point group "fdi_gym.diagnosers" are discovered; none is listed.
+Arguments of these names are given: `belief` and `calibration` are what `fdi_gym.diagnosis.fitting` found for the fault
+process that will be met, `process` is that process's name, `scenarios` the truth, for ceilings only. All others are tuning.
+Builders in the modules and packages of the entry-point group "fdi_gym.diagnosers" are discovered; none is listed.
 """
 
 from __future__ import annotations
 
-import difflib
 import functools
 import importlib
 import inspect
@@ -28,9 +27,15 @@ from typing import Any, NamedTuple
 
 from fdi_gym.diagnosis.contract import Diagnoser
 from fdi_gym.diagnosis.guard import guarded
+from fdi_gym.names import blame, check_diagnoser_name, find_function, unknown
 from fdi_gym.plant import Plant
 
-GIVEN = ("belief", "calibration", "process", "scenarios")  # arguments of a builder that are no tuning
+GIVEN = {  # arguments of a builder that are no tuning
+    "belief": "what it may assume of the plant, fitted to the process",
+    "calibration": "when it alarms, fitted to the process",
+    "process": "the fault process that will be met",
+    "scenarios": "the truth: it is clairvoyant",
+}
 
 
 class Entry(NamedTuple):
@@ -135,16 +140,27 @@ def diagnoser(name: str, summary: str, *, clairvoyant: bool = False, **settings:
 
 
 @functools.cache
-def _import_packages() -> None:
+def broken_plugins() -> dict[str, str]:
+    """The modules of the entry-point group that cannot be imported, with the reason; the others are imported."""
+    broken = {}
+
+    def load(what: str, function: Callable[[], Any]) -> Any:
+        try:
+            return function()
+        except (Exception, SystemExit) as error:
+            broken[what] = blame(error)
+            return None
+
     for entry_point in entry_points(group="fdi_gym.diagnosers"):
-        place = entry_point.load()
-        for module in pkgutil.walk_packages(getattr(place, "__path__", []), place.__name__ + "."):
-            importlib.import_module(module.name)
+        place = load(entry_point.value, entry_point.load)
+        for module in pkgutil.walk_packages(getattr(place, "__path__", []), f"{entry_point.value}.", onerror=lambda _: None):
+            load(module.name, functools.partial(importlib.import_module, module.name))
+    return broken
 
 
 def diagnosers() -> dict[str, Entry]:
     """All diagnosers by name, in the order in which their modules declare them."""
-    _import_packages()
+    broken_plugins()  # imports the modules in which they are
     return dict(_entries)
 
 
@@ -155,17 +171,17 @@ def find_diagnoser(name: str) -> Entry:
         ValueError: There is none; the message lists those that exist.
     """
     if ":" in name:
-        module, function = name.split(":", 1)
+        build = find_function("diagnoser", check_diagnoser_name(name))
         try:
-            build = getattr(importlib.import_module(module), function)
-        except (ImportError, AttributeError) as error:
-            raise ValueError(f"no diagnoser {name!r}: {error}") from error
+            arguments = inspect.signature(build).parameters
+        except (ValueError, TypeError):  # a builtin
+            arguments = {}
+        if not arguments:
+            raise ValueError(f"{name} is no builder of a diagnoser: it takes no plant")
         return Entry(name, (inspect.getdoc(build) or name).splitlines()[0], build, {}, False)
     found = diagnosers()
     if name not in found:
-        near = difflib.get_close_matches(name, found, 1)
-        hint = f" (did you mean {near[0]!r}?)" if near else ""
-        raise ValueError(f"unknown diagnoser {name!r}{hint}; there are {', '.join(found)}")
+        raise unknown("diagnoser", name, found)
     return found[name]
 
 
@@ -174,7 +190,7 @@ def make_diagnoser(
 ) -> Diagnoser:
     """A diagnoser by name, for a plant and one of its fault processes, under the guard (see `guarded`).
 
-    What it believes and when it alarms is what `fdi_gym.diagnosis.fit` found for that process: shipped where it is, else
+    What it believes and when it alarms is what `fdi_gym.diagnosis.fitting` found for that process: shipped where it is, else
     found when it is first asked for.
 
     Args:
@@ -187,7 +203,7 @@ def make_diagnoser(
     Raises:
         ValueError: Unknown name, process or keyword; `NotApplicableError` where the method cannot run on this plant.
     """
-    from fdi_gym.diagnosis.fit import knowledge_of
+    from fdi_gym.diagnosis.knowledge import knowledge_of
 
     entry = find_diagnoser(name)
     plant.process(process)
@@ -197,5 +213,13 @@ def make_diagnoser(
         if scenarios is None:
             raise ValueError(f"{name} knows the truth: it needs scenarios, one per episode")
         given["scenarios"] = scenarios
-    given |= knowledge_of(entry, plant, process, settings, scenarios)
-    return guarded(entry.build(plant, **given, **settings), plant)
+    try:
+        given |= knowledge_of(entry, plant, process, settings)
+        built = entry.build(plant, **given, **settings)
+    except ValueError:
+        raise
+    except Exception as error:
+        raise ValueError(f"the builder of {name} failed: {blame(error)}") from error
+    if not isinstance(built, Diagnoser):
+        raise ValueError(f"the builder of {name} gives {type(built).__name__}, not a Diagnoser")
+    return guarded(built, plant)

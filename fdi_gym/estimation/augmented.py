@@ -28,10 +28,12 @@ class Interval(NamedTuple):
     u: Array  # (n, n_u) the command held over it
     d: Array | None  # (n, n_d) the measured disturbance; None where none is
     known: Array  # (n, n_known) what else is known at its end
+    held: Array | None = None  # (n,) bool: a command or known signal did not report, its last value stands; None: all did
 
     def of(self, rows: Array) -> Interval:
         """Of some episodes, each as often as its row is named."""
-        return Interval(self.k[rows], self.u[rows], None if self.d is None else self.d[rows], self.known[rows])
+        d, held = (None if a is None else a[rows] for a in (self.d, self.held))
+        return Interval(self.k[rows], self.u[rows], d, self.known[rows], held)
 
 
 class AugmentedModel(NamedTuple):

@@ -1,6 +1,6 @@
 """What a filter believes of a plant before its first sample: plain data.
 
-`fdi_gym.diagnosis.fit` makes a belief from a plant's declaration and flights of a fault process; an author may write one
+`fdi_gym.diagnosis.fitting` makes a belief from a plant's declaration and flights of a fault process; an author may write one
 by hand. Nothing here flies.
 """
 

@@ -2,7 +2,7 @@
 
 One rate of false alarms for every method, whatever its statistic: what it takes to keep quiet on all but a small share of
 healthy flights is its threshold. The truth may lie off the model there as it will in the test, so a method that is too
-sure of itself is given the thresholds that this costs. `fdi_gym.diagnosis.fit` flies those flights.
+sure of itself is given the thresholds that this costs. `fdi_gym.diagnosis.fitting` flies those flights.
 """
 
 from __future__ import annotations
@@ -82,7 +82,9 @@ def _reached(statistic: Array, after: int, least: float) -> float:
     return max(float(np.quantile(sustained(statistic, after), 1 - RATE, method="higher")), least)
 
 
-def thresholds_from(plant: Plant, cost: Array, rise: Array | None, persistence: Persistence) -> tuple[dict[str, float], float | None]:
+def thresholds_from(
+    plant: Plant, cost: Array, rise: Array | None, persistence: Persistence
+) -> tuple[dict[str, float], float | None]:
     """Thresholds that a share RATE of healthy flights reaches, to four digits: of the modes, and of the rising statistic.
 
     Each mode's is what it reaches alone; one factor on them all brings the share of flights with any alarm to RATE.

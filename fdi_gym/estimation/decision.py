@@ -38,7 +38,7 @@ class Reading(NamedTuple):
     Px: Array | None = None  # (n, n_x, n_x) its covariance
     nu: Array | None = None  # (n, m) innovation, 0 where a sensor did not report
     S: Array | None = None  # (n, m, m) its covariance, as of `kalman.masked`
-    seen: Array | None = None  # (n,) sensors that reported
+    seen: Array | None = None  # (n,) sensors that reported and were used
     cost: Array | None = None  # (n, labels) how badly each label fits, in the method's own words: -2 log of a likelihood
     probs: Array | None = None  # (n, labels)
     signals: dict[str, Array] | None = None  # (n, ...) each
@@ -59,6 +59,8 @@ class Verdict(NamedTuple):
     label: Array  # (n,) int
     z: Array | None = None  # (n, p) the deviation that is reported in place of the reading's
     evidence: Evidence = Evidence()
+    P: Array | None = None  # (n, p, p) the covariance that is reported in place of the reading's
+    signals: dict[str, Array] | None = None  # (n, ...) each, beside the reading's
 
 
 class Rule(NamedTuple):
@@ -301,8 +303,9 @@ def by_channels(plant: Plant, inputs: FaultInputs, alpha: float, thresholds: Arr
         size = np.abs(smooth)
         on = np.ones(size.shape, np.int64)
         declared = declare(declared, on, size > J, size < 0.5 * J, after, np.broadcast_to(informed, size.shape))
-        label = label_of_channels(labels, sets, declared.label > 0, size / J)
-        alarm = np.any(declared.label > 0, axis=1)
-        return (smooth, declared), Verdict(alarm, label, None, Evidence(channels=size))
+        flagged = declared.label > 0
+        label = label_of_channels(labels, sets, flagged, size / J)
+        signals = {"smoothed": smooth, "channels_on": flagged}
+        return (smooth, declared), Verdict(np.any(flagged, axis=1), label, evidence=Evidence(channels=size), signals=signals)
 
     return Rule(start, step)

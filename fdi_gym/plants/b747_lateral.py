@@ -35,14 +35,17 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 import scipy.linalg
+from msgspec import UNSET, Meta, UnsetType
 
 from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Hold, Scoring
 from fdi_gym.kernels import kernel
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
+from fdi_gym.shapes import Shapes, only_with, together
 
 ID = "B747Lateral"
 VERSION = 0
@@ -73,7 +76,47 @@ VARIANTS = ("printed/open", "printed/closed", "bare/closed")
 MULTISINE_AMPLITUDE = np.array([[1.2, 0.9, 0.6], [0.5, 0.4, 0.3]])  # deg
 MULTISINE_OMEGA = np.array([[0.35, 0.75, 1.30], [0.25, 0.60, 1.05]])  # rad/s
 PAPER_PHASES = [[0.0, 2.0, 4.0], [1.0, 3.0, 5.0]]  # rad
-COMMANDS = ("multisine", "doublet", "prbs", "const", "zero")
+
+Phase = Annotated[float, Meta(ge=-1e3, le=1e3)]  # rad
+Sign = Annotated[float, Meta(ge=-1.0, le=1.0)]
+Signs = Annotated[list[Sign], Meta(min_length=1)]
+Bank = Annotated[float, Meta(ge=-60.0, le=60.0)]  # deg
+Time = Annotated[float, Meta(ge=0.0, le=1e6)]  # s
+Factor = Annotated[float, Meta(ge=0.0, le=10.0)]
+Row4 = tuple[Factor, Factor, Factor, Factor]
+Row2 = tuple[Factor, Factor]
+
+
+class Reference(msgspec.Struct, forbid_unknown_fields=True):
+    """What the pilot does: his command, a sign per second of "prbs" and surface, and bank levels of 15 s each [deg]."""
+
+    command: Literal["multisine", "doublet", "prbs", "const", "zero"] = "zero"
+    scale: Annotated[float, Meta(ge=-100.0, le=100.0)] | UnsetType = UNSET
+    phases: tuple[tuple[Phase, Phase, Phase], tuple[Phase, Phase, Phase]] | UnsetType = UNSET
+    signs: tuple[Signs, Signs] | UnsetType = UNSET
+    bank_levels: Annotated[list[Bank], Meta(min_length=1)] | UnsetType = UNSET
+
+    def __post_init__(self) -> None:
+        only_with(self, "command", {"multisine": ("scale", "phases"), "prbs": ("signs",)})
+
+
+class Gust(msgspec.Struct, forbid_unknown_fields=True):
+    """One gust, as `gust_rows` has it: times [s] and size [deg]; or none of them in calm air."""
+
+    t0: Time | UnsetType = UNSET
+    rise: Annotated[float, Meta(ge=1e-3, le=1e6)] | UnsetType = UNSET
+    size: Annotated[float, Meta(ge=-15.0, le=15.0)] | UnsetType = UNSET
+    hold: Time | UnsetType = UNSET
+
+    def __post_init__(self) -> None:
+        together(self)
+
+
+class Physical(msgspec.Struct, forbid_unknown_fields=True):
+    """Factors on the entries of the first three rows of A and of B."""
+
+    factor_A: tuple[Row4, Row4, Row4] | UnsetType = UNSET
+    factor_B: tuple[Row2, Row2, Row2, Row2] | UnsetType = UNSET
 
 
 def bare_airframe() -> tuple[np.ndarray, np.ndarray]:
@@ -166,20 +209,20 @@ def excitation(reference: Mapping[str, Any], steps: int) -> np.ndarray:
             phase = (k - start) % 200
             e[:, i] = amplitude * (1.0 * (phase < 20) - 1.0 * ((phase >= 20) & (phase < 40))) * (k >= start)
     elif command == "prbs":
-        signs = np.repeat(np.array(reference["signs"], float), 10, axis=1)[:, : steps + 1]
-        e[:] = (signs * [[1.6], [0.6]]).T
+        for i, (signs, amplitude) in enumerate(zip(reference["signs"], (1.6, 0.6), strict=True)):
+            if len(signs) <= steps // 10:
+                raise ValueError(f"{steps} steps need {steps // 10 + 1} signs for each surface, not {len(signs)}")
+            e[:, i] = amplitude * np.array(signs, float)[np.arange(steps + 1) // 10]
     elif command == "const":
         e[:] = 1.5, 0.6
-    elif command != "zero":
-        raise ValueError(f"unknown command {command!r}; there are {', '.join(COMMANDS)}")
     return e
 
 
 def reference_rows(scenario: FaultScenario) -> np.ndarray:
     """r_k = (e_aileron, e_rudder, phi_ref): the bank reference is the drawn levels through a 2 s lag."""
     steps = scenario.steps
-    levels = np.repeat(np.array(scenario.reference.get("bank_levels", [0.0])), 150)
-    level = np.pad(levels, (0, max(0, steps + 1 - levels.size)), mode="edge")[: steps + 1]
+    levels = np.array(scenario.reference.get("bank_levels", [0.0]))
+    level = levels[np.minimum(np.arange(steps + 1) // 150, levels.size - 1)]
     phi_ref = np.zeros(steps + 1)
     if levels.any():
         a, s = np.exp(-DT / 2.0), 0.0
@@ -243,7 +286,7 @@ def perturb(rng: np.random.Generator, level: float) -> dict[str, Any]:
     }
 
 
-def processes(airframe: str, closed: bool, dual: bool) -> dict[str, FaultProcess]:
+def processes(airframe: str, closed: bool, dual: bool) -> list[FaultProcess]:
     """The fault processes of one variant."""
     b_max = B_STUCK_MAX[airframe]
 
@@ -296,15 +339,11 @@ def processes(airframe: str, closed: bool, dual: bool) -> dict[str, FaultProcess
         i, onset = int(rng.integers(2)), int(rng.integers(200, 801))
         return flight(rng, [stuck(SURFACES[i], 0.0, onset, kind="float")])
 
-    def fault_free(rng: np.random.Generator) -> FaultScenario:
-        return standard(rng).without_faults()
-
     found = [
         FaultProcess(name="standard", description="one permanent fault in 80 % of the flights", sample=standard),
         FaultProcess(name="hard", description="intermittent faults, plant off the model by 5 %", sample=hard,
                      scoring=Scoring(start=151, grace=50)),
         FaultProcess(name="gust", description="the standard faults, and one lateral gust in every flight", sample=gusty),
-        FaultProcess(name="fault-free", description="the standard flights without their faults", sample=fault_free),
         FaultProcess(name="hard-over", description="a surface runs to its limit", sample=hard_over),
         FaultProcess(name="float", description="a surface floats at zero", sample=floating),
     ]  # fmt: skip
@@ -313,7 +352,7 @@ def processes(airframe: str, closed: bool, dual: bool) -> dict[str, FaultProcess
                                   sample=lambda rng: paper(), scoring=Scoring(decision="second_half")))  # fmt: skip
     if dual:
         found.append(FaultProcess(name="dual", description="one or two permanent faults", sample=two_faults))
-    return {process.name: process for process in found}
+    return found
 
 
 def _modes(airframe: str) -> tuple[FaultMode, ...]:
@@ -391,4 +430,5 @@ def plant(*, variant: str = "printed/open", labels: str = "single") -> Plant:
         processes=processes(airframe, loop == "closed", labels == "dual"),
         q=np.concatenate([gain.ravel(), U_MAX]), physical=physical, perturb=perturb, reference=reference_rows,
         disturbances=(Signal("beta_g", "deg", -15.0, 15.0, 1.0),), disturbance=gust_rows,
+        shapes=Shapes(Reference, Gust, Physical),
     )  # fmt: skip

@@ -51,13 +51,17 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec import UNSET, Meta, UnsetType
 
+from fdi_gym.checks import number
 from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Scoring
 from fdi_gym.kernels import kernel
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
+from fdi_gym.shapes import Nothing, Shapes
 
 ID = "CMGSatellite"
 VERSION = 0
@@ -368,6 +372,29 @@ def loss(unit: int, alpha: float, onset: int, end: int) -> Fault:
     return Fault(UNITS[unit], "LOE", onset, [Abrupt(f"f{unit + 1}", 1.0 - alpha)], end)
 
 
+Share = Annotated[float, Meta(ge=-0.9, le=10.0)]  # an inertia stays positive
+Mounting = Annotated[float, Meta(ge=-180.0, le=180.0)]  # deg
+
+
+class Physical(msgspec.Struct, forbid_unknown_fields=True):
+    """Relative errors of the inertias, and errors of the CMGs' mounting [deg]."""
+
+    inertia_error: tuple[Share, Share, Share] | UnsetType = UNSET
+    mounting_error_deg: tuple[Mounting, Mounting, Mounting, Mounting] | UnsetType = UNSET
+
+
+class Slew(msgspec.Struct, forbid_unknown_fields=True):
+    """The reference of a plant with the option "slew"."""
+
+    profile: Literal["slew"] = "slew"
+
+
+class Regulate(msgspec.Struct, forbid_unknown_fields=True):
+    """The reference of a plant with the option "regulate"."""
+
+    profile: Literal["regulate"] = "regulate"
+
+
 class Ranges(NamedTuple):
     """Uniform ranges of a fault window: onset and duration [s] (it ends 1 s before the horizon at least), severity."""
 
@@ -433,7 +460,7 @@ def tumble(rng: np.random.Generator) -> list[float]:
     return [*q.tolist(), *rng.uniform(-0.5, 0.5, 3).tolist(), 0.0, 0.0, 0.0, 0.0]
 
 
-def processes(profile: str) -> dict[str, FaultProcess]:
+def processes(profile: str) -> list[FaultProcess]:
     """The fault processes under one reference."""
 
     def standard(rng: np.random.Generator) -> FaultScenario:
@@ -451,8 +478,6 @@ def processes(profile: str) -> dict[str, FaultProcess]:
     found += [
         FaultProcess(name="hard", description="the four units fail and recover independently, plant off the model",
                      sample=lambda rng: intermittent(rng, profile), scoring=Scoring(start=500, grace=100)),
-        FaultProcess(name="fault-free", description="the standard flights without their faults",
-                     sample=lambda rng: standard(rng).without_faults()),
     ]  # fmt: skip
     found += [
         FaultProcess(name=name, description="the source's time line: each unit in turn, 200 s (Table 4)",
@@ -464,7 +489,7 @@ def processes(profile: str) -> dict[str, FaultProcess]:
                      initial=initial, scoring=settled)
         for name in (("table5", "paper-slew") if profile == "slew" else ("table5",))
     ]  # fmt: skip
-    return {process.name: process for process in found}
+    return found
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -496,14 +521,7 @@ def plant(
     for name, allowed in choices.items():
         if options[name] not in allowed:
             raise ValueError(f"unknown {name} {options[name]!r}; {ID} has {', '.join(allowed)}")
-    if isinstance(snr, bool) or not isinstance(snr, (int, float)) or not np.isfinite(snr):
-        raise ValueError(f"snr is a number of dB, not {snr!r}")
-
-    def rows(scenario: FaultScenario) -> np.ndarray:
-        profile = scenario.reference.get("profile", reference)
-        if profile != reference:
-            raise ValueError(f"the scenario flies the reference {profile!r}, this plant {reference!r}")
-        return _rows(reference, scenario.steps)
+    options["snr"] = snr = number("snr [dB]", snr, -40.0, 400.0)
 
     def physical(changes: Mapping[str, Any]) -> np.ndarray:
         js = np.array(JS) * (1.0 + np.array(changes.get("inertia_error", [0.0] * 3)))
@@ -536,7 +554,9 @@ def plant(
         labels=tuple(Label(" + ".join(UNITS[i] for i in s) or "none", frozenset(UNITS[i] for i in s)) for s in SETS),
         processes=processes(reference),
         q=np.array([float(steering == "robust"), NULL_AMPLITUDE if excitation == "null" else 0.0]),
-        true_feedback=feedback == "true", physical=physical, perturb=perturb, reference=rows,
+        true_feedback=feedback == "true", physical=physical, perturb=perturb,
+        reference=lambda scenario: _rows(reference, scenario.steps),
+        shapes=Shapes(Slew if reference == "slew" else Regulate, Nothing, Physical),
         quaternions=((0, 1, 2, 10),),
         monitor=lambda state: {"det": singularity(state[..., 7:])},
         isolation_reward=np.eye(16) - 1.0, identification_reward=lambda error: -np.abs(error).mean(axis=-1),

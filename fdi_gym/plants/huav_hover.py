@@ -49,14 +49,18 @@ Version history: v0, the first.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 import scipy.linalg
+from msgspec import UNSET, Meta, UnsetType
 
+from fdi_gym.checks import number
 from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Hold, Samples, Scoring, Square
 from fdi_gym.kernels import kernel
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
+from fdi_gym.shapes import Nothing, Shapes
 
 ID = "HUAVHover"
 VERSION = 0
@@ -68,9 +72,6 @@ STATES = ("u", "v", "w", "p", "q", "r", "phi", "theta", "psi", "a1f", "b1f")
 U_MIN = (-0.02, -0.12, -0.12, -0.20)  # rad: command limits
 U_MAX = (0.20, 0.12, 0.12, 0.25)
 SIGMA_V = (0.05, 0.05, 0.05, 0.005, 0.005, 0.005, 0.009, 0.009, 0.009)  # m/s, rad/s, rad: sensors
-# What the paper's filters believe: initial velocities, rates and attitude, flapping; then fault [rad] and gust [m/s]
-X0_STD = (0.1, 0.1, 0.1, 0.02, 0.02, 0.02, 0.02, 0.02, 0.02, 0.005, 0.005)
-WALKS = {"b0_std": 2e-3, "d0_std": 0.5, "b_step": 7e-4, "d_step": 0.05}
 # Beyond anything that a flight can reach before it ends; psi is not wrapped
 SENSOR_RANGE = (100.0, 100.0, 100.0, 50.0, 50.0, 50.0, np.pi, np.pi, 1000.0)  # m/s, rad/s, rad
 SIGMA_W = (*(0.004,) * 3, *(0.005,) * 3, *(2e-4,) * 5)  # m/s, rad/s, rad, rad (flapping) per step: process
@@ -319,6 +320,35 @@ def loss(channel: str, gain: float, onset: int, end: int | None = None) -> Fault
     return Fault(channel, "loe", onset, [Abrupt(f"gain_{channel}", float(gain))], end)
 
 
+Time = Annotated[float, Meta(ge=0.0, le=1e6)]  # s
+
+
+class OneGust(msgspec.Struct, forbid_unknown_fields=True):
+    """One gust, as `gust` makes it."""
+
+    t0: Time
+    rise: Annotated[float, Meta(ge=1e-3, le=1e6)]  # s
+    speed: Annotated[float, Meta(ge=-50.0, le=50.0)]  # m/s
+    hold: Time | None
+
+
+class Gusts(msgspec.Struct, forbid_unknown_fields=True):
+    """The gust of each component, where there is one."""
+
+    u_g: OneGust | UnsetType = UNSET
+    v_g: OneGust | UnsetType = UNSET
+
+
+class Physical(msgspec.Struct, forbid_unknown_fields=True):
+    """Mass [kg], inertias [kg m^2] and the share of the tail rotor's weathercock coupling in the truth."""
+
+    m: Annotated[float, Meta(ge=0.1, le=1e3)] | UnsetType = UNSET
+    Jxx: Annotated[float, Meta(ge=1e-3, le=1e3)] | UnsetType = UNSET
+    Jyy: Annotated[float, Meta(ge=1e-3, le=1e3)] | UnsetType = UNSET
+    Jzz: Annotated[float, Meta(ge=1e-3, le=1e3)] | UnsetType = UNSET
+    kappa: Annotated[float, Meta(ge=0.0, le=1.0)] | UnsetType = UNSET
+
+
 def gust(t0: float, rise: float, speed: float, hold: float | None = None) -> dict[str, float | None]:
     """One gust: from t0 [s] up as 1 - cos in `rise` [s] to speed [m/s], `hold` [s] there (None: for good), and down."""
     return {"t0": float(t0), "rise": float(rise), "speed": float(speed), "hold": None if hold is None else float(hold)}
@@ -328,16 +358,10 @@ PAPER_GUSTS = {"u_g": gust(2.0, 2.0, 4.0), "v_g": gust(5.0, 2.0, 3.0)}
 
 
 def disturbance_rows(scenario: FaultScenario) -> np.ndarray:
-    """d (steps + 1, 2): the gust at the samples.
-
-    Raises:
-        ValueError: The scenario names a gust component that does not exist.
-    """
+    """d (steps + 1, 2): the gust at the samples."""
     d = np.zeros((scenario.steps + 1, 2))
     t = np.arange(scenario.steps + 1) * DT
     for name, g in scenario.disturbance.items():
-        if name not in ("u_g", "v_g"):
-            raise ValueError(f"unknown disturbance {name!r}; {ID} has u_g, v_g")
         rise, speed = g["rise"], g["speed"]
         s = t - g["t0"]
         fall = np.full_like(s, -1.0) if g["hold"] is None else s - rise - g["hold"]
@@ -412,24 +436,23 @@ def perturb(rng: np.random.Generator, level: float) -> dict[str, float]:
     return {name: float(value * (1 + level * rng.uniform(-1, 1))) for name, value in nominal.items()}
 
 
-def _processes() -> dict[str, FaultProcess]:
+def _processes() -> list[FaultProcess]:
     scoring = Scoring(decision="second_half")
     found = [
         FaultProcess(name="standard", description="0, 1 or 2 actuator faults under random gusts", sample=sample,
                      scoring=scoring),
         FaultProcess(name="hard", description="the same, side gusts with the full weathercock coupling (kappa = 1)",
                      sample=lambda rng: sample(rng).replace(physical={"kappa": 1.0}), scoring=scoring),
-        FaultProcess(name="fault-free", description="the standard flights without their faults",
-                     sample=lambda rng: sample(rng).without_faults(), scoring=scoring),
         FaultProcess(name="paper", description="the source's scenario 1: biases on lat, lon and ped in turn",
                      sample=lambda rng: paper(1), scoring=scoring),
     ]  # fmt: skip
     words = ("biases on lat, lon and ped in turn", "lat floats, then lon is stuck", "lat floats while ped is biased",
              "scenario 1, for all filters side by side")  # fmt: skip
-    for number, description in enumerate(words, start=1):
-        found.append(FaultProcess(name=f"scenario-{number}", description=description, scoring=scoring,
-                                  sample=lambda rng, number=number: paper(number)))  # fmt: skip
-    return {process.name: process for process in found}
+    found += [
+        FaultProcess(name=f"scenario-{i}", description=text, scoring=scoring, sample=lambda rng, i=i: paper(i))
+        for i, text in enumerate(words, start=1)
+    ]
+    return found
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -480,19 +503,15 @@ def plant(*, kappa: float = 0.3, K_B: float = 0.84) -> Plant:
             filters live on it: they see a cyclic fault in the first sample only through this path.
 
     Raises:
-        ValueError: kappa outside 0 to 1.
+        ValueError: An option out of range.
     """
-    if not 0.0 <= kappa <= 1.0:
-        raise ValueError(f"kappa lies between 0 and 1, not {kappa}")
+    kappa, K_B = number("kappa", kappa, 0.0, 1.0), number("K_B", K_B, 0.0, A_CYC)
     x_trim, u_trim = trim(K_B)
     K = lqi_gain(*linearised(x_trim, u_trim, K_B))
     p = _physical(K_B)
 
     def physical(changes: Mapping[str, Any]) -> np.ndarray:
-        known = {"m", "Jxx", "Jyy", "Jzz"}
-        if unknown := set(changes) - known - {"kappa"}:
-            raise ValueError(f"unknown physical parameter {sorted(unknown)}; {ID} has {sorted(known | {'kappa'})}")
-        changed = _physical(K_B, **{name: float(value) for name, value in changes.items() if name in known})
+        changed = _physical(K_B, **{name: float(value) for name, value in changes.items() if name != "kappa"})
         changed[6:] = gust_matrix(u_trim, changes.get("kappa", kappa))
         return changed
 
@@ -504,7 +523,7 @@ def plant(*, kappa: float = 0.3, K_B: float = 0.84) -> Plant:
     scales = (0.5,) * 3 + (0.2,) * 3 + (0.1,) * 3 + (0.01,) * 2
     unit4 = np.eye(4)
     return Plant(
-        id=ID, version=VERSION, options={"kappa": float(kappa), "K_B": float(K_B)},
+        id=ID, version=VERSION, options={"kappa": kappa, "K_B": K_B},
         description="helicopter UAV in hover: actuator faults under wind gusts",
         dt=DT, substeps=1,
         kernels=Kernels(dynamics, output, control, outside=outside),
@@ -529,12 +548,7 @@ def plant(*, kappa: float = 0.3, K_B: float = 0.84) -> Plant:
         labels=labels, processes=_processes(),
         c0=np.concatenate([np.zeros(4), x_trim[9:]]),
         q=np.concatenate([K.ravel(), u_trim, x_trim, [p[5], np.exp(-DT / TAU_F)]]),
-        tuning={
-            **{name: {"x0_std": X0_STD, **WALKS} for name in ("three_stage_cdkf", "three_stage_ekf", "ascdkf")},
-            **{name: {"x0_std": X0_STD}
-               for name in ("robust_three_stage_cdkf", "robust_three_stage_ekf", "hypothesis_bank")},
-        },
-        physical=physical, perturb=perturb,
+        physical=physical, perturb=perturb, shapes=Shapes(Nothing, Gusts, Physical),
         noise=prescribed_noise, isolation_reward=np.eye(len(labels)) - 0.5 * wrongly,
         identification_reward=identification_reward,
     )  # fmt: skip

@@ -46,14 +46,18 @@ Version history: v0, the first.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 import scipy.linalg
+from msgspec import UNSET, Meta, UnsetType
 
-from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Incipient, Scoring
+from fdi_gym.checks import number
+from fdi_gym.faults import MAX_STEPS, Abrupt, Fault, FaultProcess, FaultScenario, Incipient, Scoring
 from fdi_gym.kernels import kernel
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
+from fdi_gym.shapes import Shapes, only_with
 
 ID = "MissilePitch"
 VERSION = 0
@@ -205,6 +209,38 @@ def prefilter() -> np.ndarray:
     return np.concatenate([M[:2, :2].ravel(), M[:2, 2]])
 
 
+Incidence = Annotated[float, Meta(ge=-20.0, le=20.0)]  # deg: the airframe data end there
+Mach = Annotated[float, Meta(ge=1.0, le=3.5)]
+Share = Annotated[float, Meta(ge=-1.0, le=1.0)]
+
+
+class Reference(msgspec.Struct, forbid_unknown_fields=True):
+    """The commanded incidence [deg]: zero, a sine with a period [s], or levels that are held for so many samples each."""
+
+    command: Literal["sine", "levels", "zero"] = "zero"
+    amplitude: Incidence | UnsetType = UNSET
+    period: Annotated[float, Meta(ge=DT, le=1e6)] | UnsetType = UNSET
+    levels: Annotated[list[Incidence], Meta(min_length=1)] | UnsetType = UNSET
+    holds: list[Annotated[int, Meta(ge=0, le=MAX_STEPS)]] | UnsetType = UNSET
+
+    def __post_init__(self) -> None:
+        only_with(self, "command", {"sine": ("amplitude", "period"), "levels": ("levels", "holds")})
+        if self.levels is not UNSET and self.holds is not UNSET and len(self.levels) != len(self.holds):
+            raise ValueError(f"levels and holds are of one length, not {len(self.levels)} and {len(self.holds)}")
+
+
+class Flow(msgspec.Struct, forbid_unknown_fields=True):
+    """Mach number at the start and at the end of the flight; 2.5 where it is not given."""
+
+    mach: tuple[Mach, Mach] | UnsetType = UNSET
+
+
+class Physical(msgspec.Struct, forbid_unknown_fields=True):
+    """Relative errors rho_1..8; a shorter list leaves the rest exact."""
+
+    rho: Annotated[list[Share], Meta(max_length=8)] | UnsetType = UNSET
+
+
 def mach_of(scenario: FaultScenario) -> tuple[float, float]:
     """Mach number at the start and at the end of the flight, between which it runs linearly."""
     first, last = scenario.disturbance.get("mach", (MACH, MACH))
@@ -218,12 +254,10 @@ def reference_rows(scenario: FaultScenario) -> np.ndarray:
     if wanted.get("command", "zero") == "sine":
         alpha_c = wanted["amplitude"] * np.sin(2 * np.pi * k * DT / wanted["period"])
     elif wanted.get("command") == "levels":
-        staircase = np.repeat(np.array(wanted["levels"], float), np.array(wanted["holds"], int))
-        alpha_c = np.pad(staircase, (0, max(0, k.size - staircase.size)), mode="edge")[: k.size]
-    elif wanted.get("command", "zero") == "zero":
-        alpha_c = np.zeros(k.size)
+        levels = np.array(wanted["levels"], float)  # the last one stays
+        alpha_c = levels[np.minimum(np.searchsorted(np.cumsum(wanted["holds"]), k, side="right"), levels.size - 1)]
     else:
-        raise ValueError(f"unknown command {wanted['command']!r}; there are sine, levels, zero")
+        alpha_c = np.zeros(k.size)
     first, last = mach_of(scenario)
     return np.column_stack([alpha_c * DEG, first + (last - first) * k / scenario.steps])
 
@@ -333,24 +367,21 @@ def episode(seed: int) -> tuple[FaultScenario, tuple[np.ndarray, np.ndarray]]:
     return scenario, bounded_noise(rng, scenario.steps)
 
 
-def _processes(fault_scale: float) -> dict[str, FaultProcess]:
+def _processes(fault_scale: float) -> list[FaultProcess]:
     def standard(rng: np.random.Generator) -> FaultScenario:
         return sample_standard(rng, fault_scale)
 
     def hard(rng: np.random.Generator) -> FaultScenario:
         return sample_hard(rng, fault_scale)
 
-    found = [
+    return [
         FaultProcess(name="standard", description="one permanent fault, or none in one flight of six", sample=standard),
         FaultProcess(name="hard", description="intermittent faults, plant off the model by 8 %", sample=hard,
                      scoring=Scoring(start=200, grace=100)),
-        FaultProcess(name="fault-free", description="the standard flights without their faults",
-                     sample=lambda rng: standard(rng).without_faults()),
         FaultProcess(name="study", description="the study's: aero fault from 10 s on", sample=lambda rng: study()),
         FaultProcess(name="paper", description="the same as study", sample=lambda rng: study()),
         FaultProcess(name="mirror", description="the study's with the leak", sample=lambda rng: study(2)),
     ]  # fmt: skip
-    return {process.name: process for process in found}
 
 
 def _modes() -> tuple[FaultMode, ...]:
@@ -379,8 +410,7 @@ def plant(*, noise_scale: float = 1.0, fault_scale: float = 1.0) -> Plant:
     Raises:
         ValueError: A scale out of range.
     """
-    if not noise_scale >= 0.0 or not 0.0 < fault_scale <= 2.0:
-        raise ValueError(f"noise_scale >= 0 and 0 < fault_scale <= 2 are allowed, not {noise_scale}, {fault_scale}")
+    noise_scale, fault_scale = number("noise_scale", noise_scale, 0.0, 100.0), number("fault_scale", fault_scale, 1e-6, 2.0)
     sigma = [noise_scale * s for s in SIGMA]
     reward = np.full((6, 6), -1.0)  # a wrong fault label, or one without a fault
     reward[1:, 0] = -0.5  # missed
@@ -415,5 +445,6 @@ def plant(*, noise_scale: float = 1.0, fault_scale: float = 1.0) -> Plant:
         processes=_processes(fault_scale),
         c0=np.zeros(6), q=prefilter(), physical=physical, perturb=perturb,
         reference=reference_rows, disturbance=disturbance_rows, measured_disturbance=measured_disturbance,
+        shapes=Shapes(Reference, Flow, Physical),
         noise=lambda rng, steps: bounded_noise(rng, steps, noise_scale), isolation_reward=reward,
     )  # fmt: skip

@@ -1,0 +1,205 @@
+"""What a plant's declaration and a scenario must be before a kernel sees them; the kernels themselves check nothing."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fdi_gym import shapes
+from fdi_gym.faults import Abrupt, Effect, FaultProcess, FaultScenario, Hold, Incipient, Intermittent, Samples, Square
+
+if TYPE_CHECKING:
+    from fdi_gym.plant import FaultMode, Plant, Signal
+
+X0_RANGES = 10.0  # an initial state lies within so many times its declared range
+
+
+def is_whole(value: Any) -> bool:
+    """Whether a value is an integer, Python's or NumPy's; a boolean is none."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def is_real(value: Any) -> bool:
+    """Whether a value is a number, infinite ones included; NaN and booleans are none."""
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and value == value
+
+
+def is_finite(value: Any) -> bool:
+    """Whether a value is a finite number."""
+    return is_real(value) and math.isfinite(value)
+
+
+def unknown(what: str, name: Any, known: Iterable[str], owner: str = "") -> str:
+    """The message for a name that does not exist: the nearest that does, and all of them."""
+    known = list(known)
+    near = difflib.get_close_matches(name, known, 1, 0.4) if isinstance(name, str) else []
+    guess = f"did you mean {near[0]!r}? " if near else ""
+    return f"unknown {what} {name!r}; {guess}{f'{owner} has' if owner else 'there are'} {', '.join(known) or 'none'}"
+
+
+def number(name: str, value: Any, low: float, high: float) -> float:
+    """An option as a float.
+
+    Raises:
+        ValueError: It is no number in [low, high].
+    """
+    if not is_finite(value) or not low <= value <= high:
+        raise ValueError(f"{name} is a number from {low:g} to {high:g}, not {value!r}")
+    return float(value)
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Declarations
+
+
+def check_declaration(plant: Plant) -> None:
+    """Raise ValueError where a plant's declaration contradicts itself; the message begins with the plant's id."""
+    for wrong in _wrong(plant):
+        raise ValueError(f"{plant.id}: {wrong}")
+
+
+def _wrong(plant: Plant) -> Iterable[str]:
+    if not isinstance(plant.id, str) or not re.fullmatch(r"\w+", plant.id):
+        yield f"an id is a word of letters, digits and underscores, not {plant.id!r}"
+    if not is_whole(plant.version) or plant.version < 0:
+        yield f"version is a whole number from 0 on, not {plant.version!r}"
+    if not is_finite(plant.dt) or plant.dt <= 0:
+        yield f"dt is a positive number of seconds, not {plant.dt!r}"
+    if not is_whole(plant.substeps) or plant.substeps < 0:
+        yield f"substeps is a whole number from 0 on, not {plant.substeps!r}"
+    for role, kernel in plant.kernels._asdict().items():
+        if not hasattr(kernel, "py_func") and not (kernel is None and role in plant.kernels._field_defaults):
+            yield f"the kernel {role!r} is a function marked @kernel, not {kernel!r}"
+    for role in ("physical", "reference", "monitor"):
+        if not callable(getattr(plant, role)):
+            yield f"{role} is a function, not {getattr(plant, role)!r}"
+    for role in ("states", "outputs", "commands", "known", "disturbances", "theta", "estimated"):
+        yield from _wrong_signals(role, getattr(plant, role))
+    yield from twice("commands and known signals", [s.name for s in (*plant.commands, *plant.known)])
+    yield from twice("modes", [mode.name for mode in plant.modes])
+    yield from twice("labels", [label.name for label in plant.labels])
+    yield from twice("labels' sets of modes", [sorted(label.modes) for label in plant.labels])
+    for mode in plant.modes:
+        yield from _wrong_mode(mode, len(plant.estimated))
+    names = {mode.name for mode in plant.modes}
+    unknown = {name for label in plant.labels for name in label.modes} - names
+    if unknown or not plant.labels or plant.labels[0].modes:
+        yield f"labels start with the empty set and use declared modes {sorted(names)}, not {sorted(unknown)}"
+    for name, process in plant.processes.items():
+        if not isinstance(process, FaultProcess) or process.name != name:
+            yield f"the process {name!r} is a FaultProcess of that name, not {getattr(process, 'name', process)!r}"
+    if "standard" not in plant.processes:
+        yield f"a plant needs a 'standard' fault process; there are {', '.join(plant.processes)}"
+    for name in ("c0", "q"):
+        values = np.asarray(getattr(plant, name))
+        if values.ndim != 1 or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+            yield f"{name} is a vector of finite numbers, not {getattr(plant, name)!r}"
+    reward, n = np.asarray(plant.isolation_reward), len(plant.labels)
+    if reward.shape != (n, n) or reward.dtype.kind not in "iufb" or not np.isfinite(reward).all():
+        yield f"isolation_reward holds finite numbers in the shape ({n}, {n}), not {plant.isolation_reward!r}"
+
+
+def twice(what: str, names: Sequence[Any]) -> Iterable[str]:
+    """Says which names occur more than once."""
+    if again := [name for i, name in enumerate(names) if name in names[:i]]:
+        yield f"two {what} are called {again[0]!r}"
+
+
+def _wrong_signals(role: str, signals: Sequence[Signal]) -> Iterable[str]:
+    yield from twice(role, [s.name for s in signals])
+    for s in signals:
+        if not isinstance(s.name, str) or not s.name:
+            yield f"{role}: a signal has a name, not {s.name!r}"
+        if not is_real(s.low) or not is_real(s.high) or s.low > s.high:
+            yield f"{role}: {s.name} has low <= high, not [{s.low}, {s.high}]"
+        elif not is_finite(s.nominal) or not s.low <= s.nominal <= s.high:
+            yield f"{role}: {s.name} has a nominal value within [{s.low}, {s.high}], not {s.nominal}"
+        if not is_finite(s.scale) or s.scale <= 0:
+            yield f"{role}: {s.name} has a positive scale, not {s.scale}"
+        if not is_finite(s.sigma) or s.sigma < 0:
+            yield f"{role}: {s.name} has a standard deviation sigma from 0 on, not {s.sigma}"
+
+
+def _wrong_mode(mode: FaultMode, n: int) -> Iterable[str]:
+    if not callable(mode.size):
+        yield f"the mode {mode.name!r} has a function size, not {mode.size!r}"
+    for name, length in (("bands", 2), ("offset", n), ("direction", n), ("reach", 2)):
+        values = getattr(mode, name)
+        if len(values) != length or not all(is_finite(v) for v in values):
+            yield f"the mode {mode.name!r} has {length} finite numbers in {name}, not {values!r}"
+            return
+    for name in ("bands", "reach"):
+        low, high = getattr(mode, name)
+        if low > high:
+            yield f"the mode {mode.name!r} has {name} in rising order, not {(low, high)}"
+    if not any(mode.direction) and not any(mode.offset):
+        yield f"the mode {mode.name!r} has an offset or a direction that moves something"
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Scenarios
+
+
+def check_scenario(plant: Plant, scenario: FaultScenario) -> None:
+    """Raise ValueError where a scenario does not fit its plant; the message names the field and what is allowed."""
+    if not isinstance(scenario, FaultScenario):
+        raise TypeError(f"a scenario is a FaultScenario, not {type(scenario).__name__}")
+    scenario = scenario.replace()  # its own checks once more: lists can be written to
+    if scenario.plant != plant.id:
+        raise ValueError(f"the scenario belongs to {scenario.plant}, not to {plant.id}")
+    if scenario.x0 is not None:
+        _check_state(plant, scenario.x0)
+    modes = {mode.name for mode in plant.modes}
+    for i, fault in enumerate(scenario.faults):
+        if fault.mode not in modes:
+            raise ValueError(f"faults[{i}]: no fault mode {fault.mode!r}; {plant.id} has {', '.join(sorted(modes))}")
+        for effect in fault.effects:
+            _check_effect(plant, f"faults[{i}]", effect)
+    for _, _, active in plant.label_intervals(scenario):
+        plant.label_of(active)
+    for name in ("reference", "disturbance", "physical"):
+        shape = getattr(plant.shapes, name)
+        if shape is not None:
+            shapes.check(f"{name} of a {plant.id} scenario", getattr(scenario, name), shape)
+
+
+def _check_state(plant: Plant, x0: Sequence[float]) -> None:
+    if len(x0) != len(plant.states):
+        names = ", ".join(s.name for s in plant.states)
+        raise ValueError(f"x0 has one number per state of {plant.id} ({len(plant.states)}: {names}), not {len(x0)}")
+    for value, signal in zip(x0, plant.states, strict=True):
+        middle, half = (signal.low + signal.high) / 2, (signal.high - signal.low) / 2
+        if math.isfinite(half) and not abs(value - middle) <= X0_RANGES * half:
+            low, high = middle - X0_RANGES * half, middle + X0_RANGES * half
+            raise ValueError(f"x0: {signal.name} begins within [{low:g}, {high:g}], not at {value:g}")
+
+
+def _check_effect(plant: Plant, where: str, effect: Effect) -> None:
+    entries = plant.theta_entries
+    if effect.entry not in entries:
+        raise ValueError(f"{where}: no theta entry {effect.entry!r}; {plant.id} has {', '.join(entries)}")
+    entry = plant.theta[entries.index(effect.entry)]
+    match effect:
+        case Abrupt(value=value) | Incipient(value=value) | Intermittent(value=value):
+            low = high = value
+        case Square(value=value, other=other):
+            low, high = min(value, other), max(value, other)
+        case Samples(values=values):
+            low, high = min(values), max(values)
+        case Hold(command=name):
+            if name not in plant.command_names:
+                raise ValueError(f"{where}: no command {name!r}; {plant.id} has {', '.join(plant.command_names)}")
+            command = plant.commands[plant.command_names.index(name)]
+            low, high = command.low, command.high  # the entry may get any command
+        case _:
+            raise TypeError(f"{where}: an unknown effect {effect!r}")
+    if not entry.low <= low <= high <= entry.high:
+        raise ValueError(
+            f"{where}: {entry.name} lies within [{entry.low:g}, {entry.high:g}], where {type(effect).__name__} would bring "
+            f"it to {low:g}" + (f" to {high:g}" if high > low else "")
+        )

@@ -1,0 +1,186 @@
+"""What methods know of a plant, as files: shipped with a package, or kept from an earlier session.
+
+`<package of the method>/fits/<Plant>.json` holds beliefs and calibrations by what they were made for. They are valid as long
+as the plant's code is the one that they were made from. What is not shipped is found when it is first asked for, and kept
+in the cache folder under the sources of the method.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import importlib
+import inspect
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from fdi_gym.diagnosis.fitting import fit_belief, fit_calibration
+from fdi_gym.diagnosis.registry import Entry, find_diagnoser, package_of
+from fdi_gym.estimation.belief import Belief
+from fdi_gym.estimation.calibration import Calibration
+from fdi_gym.estimation.data import from_json, to_json
+from fdi_gym.kernels import cache_folder
+from fdi_gym.plant import NotApplicableError, Plant, plant_sources
+
+
+class Fits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The file of a plant: beliefs and calibrations by what they were made for, and the digest of the plant's code."""
+
+    plant: str
+    code: str
+    beliefs: dict[str, Belief] = {}
+    calibrations: dict[str, Calibration] = {}
+
+
+def code_digest(plant: Plant) -> str:
+    """Digest of the plant's file, comments and docstrings aside; "" for a plant that no file declares."""
+    source = plant_sources().get(plant.id)
+    file = getattr(importlib.import_module(source.builder.split(":")[0]), "__file__", None) if source else None
+    return _code_digest(Path(file)) if file else ""
+
+
+@functools.cache
+def _code_digest(path: Path) -> str:
+    tree = ast.parse(path.read_bytes())
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list) and body and isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):
+            body[0].value = ast.Constant("")
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:16]
+
+
+def belief_key(plant: Plant, process: str) -> str:
+    """What a belief was made for."""
+    return json.dumps([process, dict(plant.options)], sort_keys=True)
+
+
+def calibration_key(entry: Entry, plant: Plant, process: str, settings: Mapping[str, Any]) -> str:
+    """What a calibration was made for."""
+    return json.dumps([entry.name, process, dict(plant.options), dict(settings)], sort_keys=True, default=list)
+
+
+@functools.cache
+def fits_file(folder: Path, plant_id: str) -> Fits | None:
+    """The shipped fits of a plant in a package's folder; None where there are none, or the file is no such file."""
+    path = folder / "fits" / f"{plant_id}.json"
+    try:
+        return from_json(path.read_bytes(), Fits) if path.is_file() else None
+    except (OSError, ValueError) as error:
+        print(f"fdi_gym: {path} is not used: {error}", file=sys.stderr)
+        return None
+
+
+_kept: dict[str, Any] = {}
+
+
+def _known(entry: Entry, plant: Plant, kind: str, key: str, make: Any) -> Any:
+    code = code_digest(plant)
+    home = package_of(entry)
+    shipped = fits_file(home, plant.id) if home else None
+    if shipped is not None and shipped.code == code:
+        found = getattr(shipped, kind).get(key)
+        if found is not None:
+            return found
+    place = f"{plant.env_id} {code} {kind} {key}"
+    if place not in _kept:
+        _kept[place] = _on_disk(entry, place, Belief if kind == "beliefs" else Calibration, make)
+    return _kept[place]
+
+
+def _on_disk(entry: Entry, place: str, of: Any, make: Any) -> Any:
+    """What an earlier session found with the same sources, else what is found now; a damaged file is made again."""
+    folder = cache_folder(inspect.getfile(entry.build))
+    if folder is None:
+        return make()
+    path = folder / f"fit-{hashlib.sha256(place.encode()).hexdigest()[:24]}.json"
+    try:
+        return from_json(path.read_bytes(), of)
+    except (OSError, ValueError):
+        found = make()
+    part = path.with_suffix(f".{os.getpid()}.part")
+    try:
+        part.write_bytes(to_json(found))
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)
+    return found
+
+
+def knowledge_of(entry: Entry, plant: Plant, process: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The belief and the calibration that a method's builder takes: shipped, or found now and kept for the session."""
+    found: dict[str, Any] = {}
+    if entry.takes("belief"):
+        found["belief"] = _known(entry, plant, "beliefs", belief_key(plant, process), lambda: fit_belief(plant, process))
+    if entry.takes("calibration"):
+        key = calibration_key(entry, plant, process, settings)
+        found["calibration"] = _known(
+            entry, plant, "calibrations", key,
+            lambda: fit_calibration(entry, plant, process, settings, found.get("belief")),
+        )  # fmt: skip
+    return found
+
+
+def write_fits(path: Path, fits: Fits) -> None:
+    """Write a plant's file, indented for readers."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(msgspec.json.format(to_json(fits), indent=1) + b"\n")
+
+
+def fit_all(plant: Plant, work: Sequence[tuple[Entry, str, Mapping[str, Any]]], jobs: int = -1) -> Fits:
+    """The fits of several methods (entry, process, settings) on a plant, found anew, side by side.
+
+    Methods that cannot run on the plant have none.
+    """
+    import joblib
+
+    processes = sorted({process for _, process, _ in work})
+    needed = [process for process in processes if any(p == process and entry.takes("belief") for entry, p, _ in work)]
+    beliefs = dict(zip(needed, joblib.Parallel(jobs)(joblib.delayed(_belief)(plant, p) for p in needed), strict=True))
+    tasks = [task for task in work if task[0].takes("calibration")]
+    found = joblib.Parallel(jobs, batch_size=1)(  # type: ignore[arg-type]
+        joblib.delayed(_calibration)(entry.name, plant, process, dict(settings), beliefs.get(process))
+        for entry, process, settings in tasks
+    )
+    calibrations = {
+        calibration_key(entry, plant, process, settings): calibration
+        for (entry, process, settings), calibration in zip(tasks, found, strict=True)
+        if calibration is not None
+    }
+    return Fits(
+        plant=plant.id, code=code_digest(plant),
+        beliefs={belief_key(plant, p): b for p, b in beliefs.items() if b is not None}, calibrations=calibrations,
+    )  # fmt: skip
+
+
+def _belief(plant: Plant, process: str) -> Belief | None:
+    try:
+        return fit_belief(plant, process)
+    except NotApplicableError:
+        return None
+
+
+def _calibration(
+    name: str, plant: Plant, process: str, settings: Mapping[str, Any], belief: Belief | None
+) -> Calibration | None:
+    entry = find_diagnoser(name)
+    if entry.takes("belief") and belief is None:
+        return None
+    try:
+        return fit_calibration(entry, plant, process, settings, belief)
+    except NotApplicableError:
+        return None
+
+
+def joined(parts: Sequence[Fits]) -> Fits:
+    """The fits of one plant with different options, in one file."""
+    first = parts[0]
+    beliefs = {key: b for part in parts for key, b in part.beliefs.items()}
+    calibrations = {key: c for part in parts for key, c in part.calibrations.items()}
+    return Fits(plant=first.plant, code=first.code, beliefs=beliefs, calibrations=calibrations)

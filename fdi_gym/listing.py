@@ -1,0 +1,118 @@
+"""What `fdi-gym list` says: everything there is, or one thing in full."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator
+
+from fdi_gym.diagnosis import Entry, NotApplicableError, broken_plugins, diagnosers, find_diagnoser, make_diagnoser
+from fdi_gym.diagnosis.registry import GIVEN
+from fdi_gym.faults import draw
+from fdi_gym.names import blamed, find_module, unknown
+from fdi_gym.plant import load_plant, plant_sources
+from fdi_gym.suite import Suite, load_suite, suite_names
+from fdi_gym.training import trainers
+
+
+def find_plant(text: str) -> tuple[str, str]:
+    """The plant that a plant or environment id names, and the module before a ":" that registers it, imported.
+
+    Returns:
+        (module or "", plant id)
+
+    Raises:
+        ValueError: There is none.
+    """
+    module, _, name = text.rpartition(":")
+    if module:
+        find_module(module)
+    ids = {f"{plant}-Faults-v{source.version}": plant for plant, source in plant_sources().items()}
+    if name not in ids and name not in ids.values():
+        raise unknown("plant", name, ids.values())
+    return module, ids.get(name, name)
+
+
+def overview() -> str:
+    """Names of all environments, suites, diagnosers and trainers, with a line for each; what is broken is listed as such."""
+    lines = ["Environments", *(f"  {name}-Faults-v{source.version}" for name, source in plant_sources().items())]
+    lines += ["", "Suites", *(f"  {name:32s} {_said(lambda n=name: load_suite(n).description)}" for name in suite_names())]
+    lines += ["", "Diagnosers", *(f"  {name:32s} {entry.summary}" for name, entry in diagnosers().items())]
+    lines += ["", "Trainers", *(f"  {name:32s} {found.summary}" for name, found in trainers().items())]
+    if broken := broken_plugins():
+        lines += ["", "Broken plug-ins", *(f"  {name:32s} {reason}" for name, reason in broken.items())]
+    return "\n".join(lines)
+
+
+def _said(describe: Callable[[], str]) -> str:
+    try:
+        return describe()
+    except (ValueError, OSError) as error:
+        return f"broken: {error}"
+
+
+def details(text: str) -> str:
+    """Everything about a plant, an environment, a suite, a diagnoser or a trainer; a name may be more than one of these.
+
+    Raises:
+        ValueError: Nothing is called so.
+    """
+    name = text.rpartition(":")[2]
+    ids = {*plant_sources(), *(f"{plant}-Faults-v{source.version}" for plant, source in plant_sources().items())}
+    found = []
+    if text in ids:
+        found.append(load_plant(find_plant(text)[1]).describe())
+    elif ":" in text:
+        found.append(_outside(text, name))
+    if text in suite_names() or text.endswith(".json"):
+        found.append(_suite(load_suite(text)))
+    if text in diagnosers():
+        found.append(_diagnoser(find_diagnoser(text)))
+    if text in trainers():
+        found.append(f"{text}: {trainers()[text].summary}\n\n  fdi-gym train {text} PLANT")
+    if not found:
+        raise unknown("name", text, [*ids, *suite_names(), *diagnosers(), *trainers()])
+    return "\n\n".join(found)
+
+
+def _outside(text: str, name: str) -> str:
+    """What "module:name" names: a plant that the module registers, or else a builder in it."""
+    find_module(text.rpartition(":")[0])
+    if name in plant_sources() or name in {f"{p}-Faults-v{s.version}" for p, s in plant_sources().items()}:
+        return load_plant(find_plant(text)[1]).describe()
+    return _diagnoser(find_diagnoser(text))
+
+
+def _suite(suite: Suite) -> str:
+    lines = [f"{suite.name}: {suite.description}", "", f"  environment  {suite.env}", f"  options      {suite.options}"]
+    lines += [f"  process      {suite.process}", f"  mismatch     {suite.mismatch}"]
+    lines += [f"  seeds        {suite.first_seed} to {suite.first_seed + suite.episodes - 1} ({suite.episodes} episodes)"]
+    lines += [f"  settings of {name}: {settings}" for name, settings in suite.settings.items()]
+    return "\n".join([*lines, f"  version      {suite.sha256[:12]}", "", f"  fdi-gym evaluate {suite.name}"])
+
+
+def _diagnoser(entry: Entry) -> str:
+    lines = [f"{entry.name}: {entry.summary}"]
+    lines += ["", "settings"]
+    for parameter in list(inspect.signature(entry.build).parameters.values())[1:]:
+        if parameter.name in GIVEN:
+            lines.append(f"  {parameter.name:20s} {GIVEN[parameter.name]}")
+        elif parameter.name in entry.settings:
+            lines.append(f"  {parameter.name:20s} {entry.settings[parameter.name]!r} under this name")
+        elif parameter.default is not inspect.Parameter.empty:
+            lines.append(f"  {parameter.name:20s} {parameter.default!r}")
+        else:
+            lines.append(f"  {parameter.name:20s} no default")
+    return "\n".join([*lines, "", "plants, as they are by default", *_plants(entry)])
+
+
+def _plants(entry: Entry) -> Iterator[str]:
+    for plant_id in plant_sources():
+        plant = load_plant(plant_id)
+        try:
+            with blamed(entry.name):
+                make_diagnoser(entry.name, plant, scenarios=[draw(plant.process("standard"), 0)])
+            yield f"  {plant_id:20s} runs"
+        except NotApplicableError as error:
+            yield f"  {plant_id:20s} does not run: {error}"
+        except ValueError as error:
+            yield f"  {plant_id:20s} fails: {error}"

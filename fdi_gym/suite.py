@@ -1,0 +1,220 @@
+"""Suites: frozen JSON files that say which environment, which fault process and which seeds.
+
+A suite's content hash travels with every result.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from fdi_gym.diagnosis import find_diagnoser
+from fdi_gym.faults import FaultScenario, draw
+from fdi_gym.files import RefusedError, digest, pretty, read_json, write_whole
+from fdi_gym.names import blame, check_diagnoser_name, check_name, find_function, find_module, unknown
+from fdi_gym.plant import Plant, load_plant, plant_sources
+
+_PACKAGED = Path(__file__).parent / "suites"
+_CHECKOUT = Path(__file__).parent.parent / "leaderboards" / "suites"
+SUITES = _CHECKOUT if _CHECKOUT.is_dir() else _PACKAGED
+LARGEST = 2**20  # bytes of a suite's file
+EPISODES, SEEDS = 100_000, 2**62  # upper ends
+
+
+def scenarios_digest(scenarios: Sequence[FaultScenario]) -> str:
+    """Digest of scenarios to nine digits: another machine's last bits don't matter, another sampler does."""
+
+    def rounded(value: Any) -> Any:
+        if isinstance(value, float):
+            return f"{value:.9g}"
+        if isinstance(value, dict):
+            return {key: rounded(entry) for key, entry in value.items()}
+        return [rounded(entry) for entry in value] if isinstance(value, list) else value
+
+    return digest([rounded(msgspec.to_builtins(scenario)) for scenario in scenarios])
+
+
+def checked_options(plant_id: str, options: Mapping[str, Any], *, typed: bool = True) -> dict[str, Any]:
+    """A plant's options, of the types that its builder declares.
+
+    Args:
+        plant_id: The plant.
+        options: Values by name.
+        typed: The values have their types; False for text that a user typed ("0.5").
+
+    Raises:
+        ValueError: Unknown plant or option, or a value of another type.
+    """
+    sources = plant_sources()
+    if plant_id not in sources:
+        raise unknown("plant", plant_id, sources)
+    build = find_function("plant", sources[plant_id].builder)
+    signature = inspect.signature(build, eval_str=True).parameters
+    found = {}
+    for name, value in options.items():
+        if name not in signature:
+            raise unknown(f"option of {plant_id}", name, signature)
+        kind = signature[name].annotation
+        kind = type(signature[name].default) if kind is inspect.Parameter.empty else kind
+        try:
+            found[name] = msgspec.convert(value, kind, strict=typed)
+        except msgspec.ValidationError as error:
+            raise ValueError(f"the option {name} of {plant_id}: {error}, not {value!r}") from None
+        if isinstance(found[name], float) and not math.isfinite(found[name]):
+            raise ValueError(f"the option {name} of {plant_id} is a finite number, not {value!r}")
+    return found
+
+
+class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is run.
+
+    Args:
+        name: Name of the file, without ".json".
+        description: One line for the table.
+        env: Environment id; "module:id" where the module registers it.
+        plant: Plant id.
+        options: Options of the plant.
+        process: Name of the fault process.
+        mismatch: Level of mismatch, from 0 to 1; None for what the process prescribes.
+        first_seed, episodes: The public seeds are first_seed, first_seed + 1, ...
+        settings: Per diagnoser, tuning that belongs to this suite (the prior of an oracle).
+        scenarios_sha256: Digest of the drawn scenarios: a changed sampler shows.
+        sha256: Digest of all the rest of this file.
+
+    Raises:
+        ValueError: A name that cannot be a file's, a number out of range, a description of more than a line.
+    """
+
+    name: str
+    description: str
+    env: str
+    plant: str
+    options: dict[str, Any]
+    process: str
+    mismatch: float | None
+    first_seed: int
+    episodes: int
+    settings: dict[str, dict[str, Any]]
+    scenarios_sha256: str = ""
+    sha256: str = ""
+
+    def __post_init__(self) -> None:
+        check_name("suite", self.name)
+        if not self.description.isprintable() or len(self.description) > 300:
+            raise ValueError(f"a description is one line of up to 300 printable characters, not {self.description[:80]!r}")
+        for diagnoser in self.settings:
+            check_diagnoser_name(diagnoser)
+        if not 1 <= self.episodes <= EPISODES:
+            raise ValueError(f"episodes is from 1 to {EPISODES}, not {self.episodes}")
+        if not 0 <= self.first_seed <= SEEDS:
+            raise ValueError(f"first_seed is from 0 to 2^62, not {self.first_seed}")
+        if self.mismatch is not None and not 0 <= self.mismatch <= 1:
+            raise ValueError(f"mismatch is from 0 to 1, not {self.mismatch}")
+
+    def content_sha256(self) -> str:
+        """The digest that `sha256` must equal."""
+        return digest({k: v for k, v in msgspec.structs.asdict(self).items() if k != "sha256"})
+
+    def sealed(self) -> Suite:
+        """The suite with its digests, computed."""
+        drawn = scenarios_digest(self.scenarios(self.build(), range(self.episodes)))
+        suite = msgspec.structs.replace(self, scenarios_sha256=drawn)
+        return msgspec.structs.replace(suite, sha256=suite.content_sha256())
+
+    def head(self, episodes: int) -> Suite:
+        """The first episodes as a suite of their own, for a quick look; its rows are not rows of this one."""
+        return msgspec.structs.replace(self, name=f"{self.name}-{episodes}", episodes=episodes).sealed()
+
+    def build(self) -> Plant:
+        """The plant.
+
+        Raises:
+            ValueError: It cannot be built, has no such process, or is not the one that the environment id says.
+        """
+        module, _, env_id = self.env.rpartition(":")
+        if module:
+            find_module(module)
+        options = checked_options(self.plant, self.options)
+        try:
+            plant = load_plant(self.plant, **options)
+        except ValueError:
+            raise
+        except Exception as error:
+            raise ValueError(f"{self.plant} cannot be built with {options}: {blame(error)}") from error
+        if self.process not in plant.processes:
+            raise unknown(f"process of {self.plant}", self.process, plant.processes)
+        if plant.env_id != env_id:
+            raise ValueError(f"{self.name} is of {env_id!r}; this {self.plant} is {plant.env_id}")
+        if self.mismatch is not None and plant.perturb is None:
+            raise ValueError(f"{self.plant} has no mismatch")
+        return plant
+
+    def scenarios(self, plant: Plant, episodes: Sequence[int]) -> list[FaultScenario]:
+        """The scenarios of these episodes (0, 1, ...): those of `reset(seed=first_seed + i)`."""
+        process, perturb = plant.process(self.process), None
+        if self.mismatch is not None:
+            drawn: Callable[..., Mapping[str, Any]] = plant.perturb  # type: ignore[assignment]
+            perturb = lambda rng: drawn(rng, self.mismatch)  # noqa: E731
+        return [draw(process, self.first_seed + i, perturb) for i in episodes]
+
+    def check_scenarios(self, plant: Plant) -> None:
+        """Make sure that this version draws what the suite was frozen with.
+
+        Raises:
+            ValueError: It does not.
+        """
+        if scenarios_digest(self.scenarios(plant, range(self.episodes))) != self.scenarios_sha256:
+            raise ValueError(f"{self.name}: this version draws other scenarios than the suite was frozen with")
+
+
+def suite_names() -> list[str]:
+    """Names of the suites that ship with the package."""
+    return sorted(path.stem for path in SUITES.glob("*.json"))
+
+
+def load_suite(name: str) -> Suite:
+    """A suite by name, or from a path that ends in ".json".
+
+    Raises:
+        ValueError: No such suite; `RefusedError` where its file is none, or was edited after it was frozen.
+    """
+    if name.endswith(".json"):
+        path = Path(name)
+        if not path.is_file():
+            raise ValueError(f"there is no suite {name}")
+    elif name not in suite_names():
+        raise unknown("suite", name, suite_names())
+    else:
+        path = SUITES / f"{name}.json"
+    suite = read_json(path, Suite, "suite", LARGEST)
+    if suite.name != path.stem:
+        raise RefusedError(f"{path} holds a suite that is called {suite.name}")
+    if suite.sha256 != suite.content_sha256():
+        raise RefusedError(
+            f"{path} was edited after it was frozen: its hash is {suite.content_sha256()[:12]}, it says {suite.sha256[:12]}"
+        )
+    return suite
+
+
+def freeze(suite: Suite, folder: Path = SUITES) -> Path:
+    """Write a suite with its digests. A frozen suite is not changed: a different one needs another name.
+
+    Raises:
+        ValueError: A suite of that name and another content exists, or settings are of no diagnoser or not its own.
+    """
+    for name, settings in suite.settings.items():
+        allowed = inspect.signature(find_diagnoser(name).build).parameters
+        for key in settings:
+            if key not in allowed:
+                raise unknown(f"setting of {name}", key, list(allowed)[1:])
+    suite = suite.sealed()
+    path = folder / f"{suite.name}.json"
+    if path.exists() and read_json(path, Suite, "suite", LARGEST).sha256 != suite.sha256:
+        raise ValueError(f"{path} is frozen with another content; choose another name")
+    write_whole(path, pretty(suite))
+    return path
