@@ -80,6 +80,9 @@ def _wrong(plant: Plant) -> Iterable[str]:
             yield f"{role} is a function, not {getattr(plant, role)!r}"
     for role in ("states", "outputs", "commands", "known", "disturbances", "theta", "estimated"):
         yield from _wrong_signals(role, getattr(plant, role))
+    for parts in plant.quaternions:
+        if len(set(parts)) != 4 or len(parts) != 4 or not all(is_whole(i) and 0 <= i < len(plant.outputs) for i in parts):
+            yield f"quaternions are four different positions among the {len(plant.outputs)} outputs each, not {parts!r}"
     yield from twice("commands and known signals", [s.name for s in (*plant.commands, *plant.known)])
     yield from twice("modes", [mode.name for mode in plant.modes])
     yield from twice("labels", [label.name for label in plant.labels])
@@ -123,6 +126,8 @@ def _wrong_signals(role: str, signals: Sequence[Signal]) -> Iterable[str]:
             yield f"{role}: {s.name} has a positive scale, not {s.scale}"
         if not is_finite(s.sigma) or s.sigma < 0:
             yield f"{role}: {s.name} has a standard deviation sigma from 0 on, not {s.sigma}"
+        if not is_finite(s.period) or s.period < 0:
+            yield f"{role}: {s.name} has a period from 0 on, not {s.period}"
 
 
 def _wrong_mode(mode: FaultMode, n: int) -> Iterable[str]:

@@ -1,7 +1,8 @@
 """Measurements that mean the same: a quaternion and its negative, an angle and itself a turn later.
 
 A plant declares which of its outputs are such (`Plant.quaternions`, `Signal.period`). A sensor may report either at any
-sample; a filter gets the one nearest its prediction.
+sample; a filter gets the one nearest its prediction. Where neither a quaternion nor its negative is clearly nearer, it is
+the one with the expected sign.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import numpy as np
 
 from fdi_gym.plant import Array, Plant
 
-NEARER = 4.0  # squared distances: a sign that nobody reports is not turned by noise about zero
+CLEAR = 4.0  # ratio of squared distances: noise about zero turns no sign, nor does a prior that says little
 
 
 def has_equivalents(plant: Plant) -> bool:
@@ -38,10 +39,12 @@ def nearest(plant: Plant, y: Array, seen: Array, expected: Array) -> Array:
         parts = [*vector, sign]
         p, there = np.nan_to_num(expected[:, parts]), seen[:, parts] & np.isfinite(expected[:, parts])
         q = y[:, parts]
+        opposite = there[:, 3] & (q[:, 3] * p[:, 3] < 0.0)
         p[:, 3] *= _scalar(p[:, :3])
         q[:, 3] *= np.where(there[:, :3].all(axis=1), _scalar(q[:, :3]), np.abs(p[:, 3]))
         same, other = (np.where(there, (q - e) ** 2, 0.0).sum(axis=1) for e in (p, -p))
-        turned = NEARER * other < same
+        clear = CLEAR * np.minimum(same, other) < np.maximum(same, other)
+        turned = np.where(clear, other < same, opposite)
         if turned.any():
             found = found.copy()
             found[:, parts] *= np.where(turned, -1.0, 1.0)[:, None]

@@ -12,7 +12,8 @@
 | fault theta | effectiveness f1..f4 of the CMGs: 1 healthy, 0 dead |
 
 The attitude is propagated continuously: q4 may become negative, and y carries its sign. Consumers rebuild
-q4 = sign sqrt(max(0, 1 - |q_v|^2)); q and -q are the same attitude, d and d + 2 pi the same gimbal angle. The gimbals always move as commanded, so only w and q carry fault information.
+q4 = sign sqrt(max(0, 1 - |q_v|^2)); q and -q are the same attitude, d and d + 2 pi the same gimbal angle. The gimbals
+always move as commanded, so only w and q carry fault information.
 
 Options:
     reference: "slew" (default; roll, pitch and yaw follow sines of 5 deg and 13, 16 and 20 s) or "regulate" (the
