@@ -191,6 +191,14 @@ COMMANDS: dict[str, Any] = {
 }  # fmt: skip
 
 
+def _said(error: ValueError | OSError) -> str:
+    """An error in one line, after whose it is."""
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        text = error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
+    return " ".join("".join([*(f"{note}: " for note in getattr(error, "__notes__", [])), text]).split())
+
+
 def main(argv: list[str] | None = None) -> None:
     """Entry point of `fdi-gym`. Errors that a user can mend are one line on stderr, exit status 2."""
     argv = sys.argv[1:] if argv is None else argv
@@ -211,8 +219,7 @@ def main(argv: list[str] | None = None) -> None:
         print("\nfdi-gym: interrupted; the same command goes on from what is finished", file=sys.stderr)
         raise SystemExit(130) from None
     except (ValueError, OSError) as error:
-        about = "".join(f"{note}: " for note in getattr(error, "__notes__", []))
-        print(f"fdi-gym: {about}{' '.join(str(error).split())}", file=sys.stderr)
+        print(f"fdi-gym: {_said(error)}", file=sys.stderr)
         raise SystemExit(2) from None
 
 
