@@ -272,6 +272,7 @@ ARGUMENTS = [
     "sequence_net", "0", "-1", "2", "1e3", "nan", "inf", "0.5", "{}", '{"null": {}}', "[", "best", "none",
     "baselines.trivial:null", "json:dumps", "no.such:thing", "a:b:c", "--", "-", "--help", "--version", "kappa", "~", ".",
 ]  # fmt: skip
+POSITIONAL = {"evaluate": 1, "verify": 1, "leaderboard": 0, "list": 1, "freeze": 1, "train": 2}
 PLACES = ["out", "results", "deep/er", "small.json", "", "\x00", "a" * 300, "/dev/zero"]  # where something is to be written
 WRITING = ("--results", "--work", "--page", "--output")
 
@@ -281,21 +282,19 @@ def command_line(rng):
     commands = list(OPTIONS)
     command = commands[rng.integers(len(commands))]
     pick = lambda: ARGUMENTS[rng.integers(len(ARGUMENTS))]  # noqa: E731
-    argv = [command if rng.random() < 0.95 else pick(), *(pick() for _ in range(rng.integers(3)))]
+    count = POSITIONAL[command] if rng.random() < 0.8 else int(rng.integers(4))
+    argv = [command if rng.random() < 0.97 else pick(), *(pick() for _ in range(count))]
     if command == "train":  # with nothing to train, however the rest turns out
-        argv += ["--budget", ["0", "-1", "x", "nan"][rng.integers(4)]]
+        argv += ["--budget", ["0", "-1", "0", "nan"][rng.integers(4)]]
     if command == "evaluate":
-        argv += [
-            "--diagnosers",
-            ["null", "nul", "random", pick()][rng.integers(4)],
-            "--jobs",
-            ["1", "0", "x"][rng.integers(3)],
-        ]
+        argv[1:2] = ["small" if rng.random() < 0.5 else pick()]
+        argv += ["--diagnosers", ["null", "nul", "random", pick()][rng.integers(4)]]
+        argv += ["--jobs", ["1", "1", "0", "x"][rng.integers(4)]]
     if command == "freeze" and rng.random() < 0.7:
         argv[1:] = [pick(), "--plant", "B747Lateral", "--process", "standard", "--description", pick(), "--episodes", "2"]
-    for _ in range(rng.integers(3)):
+    for _ in range(int(rng.choice(3, p=[0.5, 0.35, 0.15]))):
         option = [*OPTIONS[command], "--x"][rng.integers(len(OPTIONS[command]) + 1)]
-        argv += [option, PLACES[rng.integers(len(PLACES))]] if option in WRITING else [option, pick()][: rng.integers(1, 3)]
+        argv += [option, PLACES[rng.integers(len(PLACES))]] if option in WRITING else [option, pick()]
     return argv
 
 
