@@ -81,7 +81,10 @@ def verify(
     from fdi_gym.row import MADE
     from fdi_gym.verification import verify as check
 
-    for path in [path for path in rows if path.name != MADE]:  # so that *.json will do
+    rows = tuple(path for path in rows if path.name != MADE)  # so that *.json will do
+    if not rows:
+        raise ValueError("there are no rows to verify")
+    for path in rows:
         episodes = check(path, share, seed=seed, suite=suite, trust=trust)
         print(f"{path}: every figure follows from the episodes; {len(episodes)} run again, same outcomes: {episodes}")
 

@@ -79,6 +79,7 @@ WRONG = [
     (("evaluate", "b747-paper", "--diagnosers", "null", "--jobs", "-3"), "jobs is 1 or more, or -1"),
     (("evaluate", "b747-paper", "--diagnosers", "null", "--results", "/proc/none"), "cannot write results to /proc/none"),
     (("evaluate", "b747-paper", "--diagnosers", "mekf"), "none of these diagnosers can run on B747Lateral"),
+    (("verify",), "there are no rows"), (("verify", "results/made.json"), "there are no rows"),
     (("verify", "nowhere.json"), "nowhere.json is no file"), (("verify", "/dev/zero"), "/dev/zero is no file"),
     (("verify", "."), "is no file"), (("verify", "x.json", "--share", "2"), "share is above 0 and up to 1"),
     (("verify", "x.json", "--share", "0"), "share is above 0 and up to 1"),
