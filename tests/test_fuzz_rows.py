@@ -300,14 +300,14 @@ def command_line(rng):
 
 @both
 def test_command_lines(home, tmp_path, monkeypatch, size, counted):
-    shutil.copytree(home / "small", tmp_path / "results" / "small")
-    shutil.copy(home / "small.json", tmp_path)
-    (tmp_path / "suites").mkdir()
-    shutil.copy(home / "small.json", tmp_path / "suites")
-    monkeypatch.setattr(suite, "SUITES", tmp_path / "suites")
+    here = tmp_path / "here"
+    shutil.copytree(home / "small", here / "results" / "small")
+    shutil.copy(home / "small.json", here)
+    (here / "suites").mkdir()
+    shutil.copy(home / "small.json", here / "suites")
+    monkeypatch.setattr(suite, "SUITES", here / "suites")
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.chdir(tmp_path)
-    outside = {path: path.stat().st_mtime_ns for path in tmp_path.parent.iterdir() if path != tmp_path}
+    monkeypatch.chdir(here)
     committed = {path: path.stat().st_mtime_ns for path in (ROOT / "leaderboards").rglob("*")}
     ends: dict[int, int] = {}
     for seed in range(counted("commands")):
@@ -324,6 +324,6 @@ def test_command_lines(home, tmp_path, monkeypatch, size, counted):
         assert code == 0 or err.getvalue().strip(), argv
         assert "Traceback" not in err.getvalue(), (argv, err.getvalue())
     assert ends[0] > 0 < ends[2]
-    assert {p: p.stat().st_mtime_ns for p in tmp_path.parent.iterdir() if p != tmp_path} == outside
+    assert list(tmp_path.iterdir()) == [here]  # no name led out of the folder
     assert {p: p.stat().st_mtime_ns for p in (ROOT / "leaderboards").rglob("*")} == committed
-    assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".") and os.path.isfile(path)]
+    assert not [path for path in here.rglob("*") if path.name.startswith(".") and os.path.isfile(path)]
