@@ -78,8 +78,12 @@ def verify(
         suite: Name of a suite, or path of a suite file. Default: the one that the row names.
         trust: Diagnosers "module:function" that may be imported. Look at their code first.
     """
+    from fdi_gym.row import MADE
     from fdi_gym.verification import verify as check
 
+    rows = tuple(path for path in rows if path.name != MADE)  # so that *.json will do
+    if not rows:
+        raise ValueError("there are no rows to verify")
     for path in rows:
         episodes = check(path, share, seed=seed, suite=suite, trust=trust)
         print(f"{path}: every figure follows from the episodes; {len(episodes)} run again, same outcomes: {episodes}")
@@ -190,6 +194,14 @@ COMMANDS: dict[str, Any] = {
 }  # fmt: skip
 
 
+def _said(error: ValueError | OSError) -> str:
+    """An error in one line, after whose it is."""
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        text = error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
+    return " ".join("".join([*(f"{note}: " for note in getattr(error, "__notes__", [])), text]).split())
+
+
 def main(argv: list[str] | None = None) -> None:
     """Entry point of `fdi-gym`. Errors that a user can mend are one line on stderr, exit status 2."""
     argv = sys.argv[1:] if argv is None else argv
@@ -210,8 +222,7 @@ def main(argv: list[str] | None = None) -> None:
         print("\nfdi-gym: interrupted; the same command goes on from what is finished", file=sys.stderr)
         raise SystemExit(130) from None
     except (ValueError, OSError) as error:
-        about = "".join(f"{note}: " for note in getattr(error, "__notes__", []))
-        print(f"fdi-gym: {about}{' '.join(str(error).split())}", file=sys.stderr)
+        print(f"fdi-gym: {_said(error)}", file=sys.stderr)
         raise SystemExit(2) from None
 
 

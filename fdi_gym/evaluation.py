@@ -261,7 +261,7 @@ def evaluate(
     plan.folder.mkdir(parents=True, exist_ok=True)
     sweep(plan.folder)
     total = len(plan.names) * len(plan.ranges)
-    parallel = joblib.Parallel(n_jobs=min(jobs, total), batch_size=1, return_as="generator_unordered")
+    parallel: Any = joblib.Parallel(n_jobs=min(jobs, total), return_as="generator_unordered")
     with tqdm(total=total, desc=suite.name, unit="block", disable=not progress) as bar:
         for name, first, seconds in parallel(plan.tasks(bar)):
             plan.seconds[name] = seconds

@@ -7,6 +7,7 @@ nested without end, cut off, of another kind or not text is the same clear error
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import re
@@ -79,8 +80,11 @@ def write_whole(path: Path, content: bytes) -> None:
     """Write a file so that it is either there whole or not there.
 
     Raises:
-        OSError: It cannot be written, for example because the disk is full; nothing is left behind.
+        OSError: It cannot be written, for example because the disk is full, or something that is no file has that name;
+            nothing is left behind.
     """
+    if path.exists() and not path.is_file():  # a device or a pipe would be replaced
+        raise OSError(errno.EINVAL, f"cannot write {path}: it is no file")
     part = path.with_name(f".{path.name}.{socket.gethostname().replace('.', '-')}.{os.getpid()}.part")
     try:
         part.write_bytes(content)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import inspect
 from collections.abc import Callable, Iterator
 
@@ -70,7 +71,9 @@ def details(text: str) -> str:
     if text in trainers():
         found.append(f"{text}: {trainers()[text].summary}\n\n  fdi-gym train {text} PLANT")
     if not found:
-        raise unknown("name", text, [*ids, *suite_names(), *diagnosers(), *trainers()])
+        everything = [*sorted(ids), *suite_names(), *diagnosers(), *trainers()]
+        near = " or ".join(difflib.get_close_matches(text, everything, 3))
+        raise ValueError(f"nothing is called {text!r}; {f'did you mean {near}? ' if near else ''}'fdi-gym list' names all")
     return "\n\n".join(found)
 
 

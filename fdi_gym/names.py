@@ -18,7 +18,7 @@ _MODULE = re.compile(r"\w+(?:\.\w+)*", re.ASCII)
 def unknown(kind: str, name: str, known: Iterable[str]) -> ValueError:
     """The error for a name that does not exist: the nearest one that does, and all of them."""
     known = list(known)
-    near = difflib.get_close_matches(name, known, 1)
+    near = difflib.get_close_matches(name, known, 1, 0.5)
     return ValueError(
         f"unknown {kind} {name!r}; {f'did you mean {near[0]}? ' if near else ''}there are {', '.join(known) or 'none'}"
     )

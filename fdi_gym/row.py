@@ -17,7 +17,18 @@ from typing import Any, Literal, NamedTuple
 
 import msgspec
 
-from fdi_gym.files import RefusedError, compress, decode, decompress, digest, pretty, read_bytes, read_json, write_whole
+from fdi_gym.files import (
+    RefusedError,
+    compress,
+    decode,
+    decompress,
+    digest,
+    pretty,
+    read_bytes,
+    read_json,
+    sweep,
+    write_whole,
+)
 from fdi_gym.metrics import Outcome, check_outcomes
 from fdi_gym.names import check_diagnoser_name, check_name, file_name
 from fdi_gym.plant import Plant
@@ -177,6 +188,7 @@ def check_writable(results: Path, suite: Suite, rows: Mapping[str, Mapping[str, 
         probe.unlink()
     except OSError as error:
         raise ValueError(f"cannot write results to {folder}: {error.strerror or error}") from error
+    sweep(folder)
     read_made(folder)
     for name, digests in rows.items():
         path = row_path(results, suite.name, name)

@@ -1,7 +1,6 @@
-"""Suites, evaluation, rows: frozen, resumable, checkable."""
+"""Suites and their evaluation: frozen, resumable, the same on any number of blocks and workers."""
 
 import json
-import os
 from pathlib import Path
 
 import msgspec
@@ -9,42 +8,36 @@ import numpy as np
 import pytest
 from conftest import ROOT, build
 
-from fdi_gym import cli, evaluation, leaderboard
+from fdi_gym import cli, evaluation, leaderboard, suite
 from fdi_gym.diagnosis import make_diagnoser
 from fdi_gym.envs import FDIEnv
-from fdi_gym.evaluation import Suite, evaluate, freeze, load_suite, suite_names
+from fdi_gym.evaluation import evaluate
+from fdi_gym.files import RefusedError
+from fdi_gym.row import row_path, write_rows
+from fdi_gym.suite import Suite, freeze, load_suite, scenarios_digest, suite_names
 
 NAMES = ["null", "two_stage_kf_exponential", "known_onset_oracle"]
+QUIET = {"jobs": 1, "progress": False}
 
 
 @pytest.fixture(scope="module")
-def suite(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("suites")
-    small = Suite(name="small", description="a test", env="B747Lateral-Faults-v0", plant="B747Lateral",
-                  options={"variant": "printed/open", "labels": "single"}, scenario="standard", mismatch=None,
+def small(tmp_path_factory):
+    """A frozen suite of 12 episodes: its path."""
+    found = Suite(name="small", description="a test", env="B747Lateral-Faults-v0", plant="B747Lateral",
+                  options={"variant": "printed/open", "labels": "single"}, process="standard", mismatch=None,
                   first_seed=300, episodes=12, settings={})  # fmt: skip
-    return str(freeze(small, folder))
+    return freeze(found, tmp_path_factory.mktemp("suites"))
 
 
 @pytest.fixture(scope="module")
-def rows(suite, tmp_path_factory):
-    results = tmp_path_factory.mktemp("results")
-    frozen = load_suite(suite)
-    made, timing = evaluate(frozen, NAMES, work=tmp_path_factory.mktemp("work"), jobs=1, progress=False, command="test")
-    leaderboard.write_rows(results, frozen, made, timing)
-    return results
+def found(small, tmp_path_factory):
+    return evaluate(load_suite(str(small)), NAMES, work=tmp_path_factory.mktemp("work"), command="test", **QUIET)
 
 
-@pytest.fixture
-def small_suites(suite, monkeypatch):
-    monkeypatch.setattr(evaluation, "SUITES", Path(suite).parent)
-
-
-def test_rows_agree_with_playing_the_environment(suite, rows):
+def test_rows_agree_with_playing_the_environment(small, found):
     """The same seeds through gym's interface give the same labels, sample by sample."""
-    frozen = load_suite(suite)
-    row = leaderboard.read_row(leaderboard.row_path(rows, "small", "two_stage_kf_exponential"))
-    env = FDIEnv(frozen.plant, scenario=frozen.scenario, **frozen.options)
+    frozen = load_suite(str(small))
+    env = FDIEnv(frozen.plant, "isolation", frozen.process, **frozen.options)
     diagnoser = make_diagnoser("two_stage_kf_exponential", env.plant)
     for i in (0, 5):
         obs, info = env.reset(seed=frozen.first_seed + i)
@@ -56,22 +49,18 @@ def test_rows_agree_with_playing_the_environment(suite, rows):
                 break
             obs, reward, terminated, truncated, info = env.step(said.label[0])
             right, over = right + reward, terminated or truncated
-        counted = sum(c for true, declared, c in row.outcomes[i].confusion if true == declared)
-        assert right == counted
+        outcome = found["two_stage_kf_exponential"].outcomes[i]
+        assert right == sum(c for true, declared, c in outcome.confusion if true == declared)
 
 
-def test_oracle_is_above_the_filter_and_null_below(rows):
-    accuracy = {
-        name: leaderboard.read_row(leaderboard.row_path(rows, "small", name)).metrics["per_sample"]["balanced_accuracy"]
-        for name in NAMES
-    }
+def test_oracle_is_above_the_filter_and_null_below(found):
+    accuracy = {name: one.row.metrics["per_sample"]["balanced_accuracy"] for name, one in found.items()}
     assert accuracy["null"] < accuracy["two_stage_kf_exponential"] < accuracy["known_onset_oracle"]
 
 
-def test_a_killed_run_resumes_to_the_same_bytes(suite, tmp_path, monkeypatch):
-    frozen = load_suite(suite)
-    small = {"jobs": 1, "progress": False, "block": 4}
-    whole, _ = evaluate(frozen, NAMES, work=tmp_path / "a", **small)
+def test_a_killed_run_resumes_to_the_same_bytes(small, tmp_path, monkeypatch):
+    frozen = load_suite(str(small))
+    whole = evaluate(frozen, NAMES, work=tmp_path / "a", block=4, **QUIET)
     calls = []
     real = evaluation.diagnose
 
@@ -83,169 +72,85 @@ def test_a_killed_run_resumes_to_the_same_bytes(suite, tmp_path, monkeypatch):
 
     monkeypatch.setattr(evaluation, "diagnose", killed)
     with pytest.raises(KeyboardInterrupt):
-        evaluate(frozen, NAMES, work=tmp_path / "b", **small)
+        evaluate(frozen, NAMES, work=tmp_path / "b", block=4, **QUIET)
     calls.clear()
     calls.extend([1] * 10)
-    resumed, _ = evaluate(frozen, NAMES, work=tmp_path / "b", **small)
+    resumed = evaluate(frozen, NAMES, work=tmp_path / "b", block=4, **QUIET)
     assert len(calls) - 10 == 3 * len(NAMES) - 4  # what had been finished was not run again
-    assert msgspec.json.encode(resumed) == msgspec.json.encode(whole)
+    for name in NAMES:
+        assert msgspec.json.encode(resumed[name][:2]) == msgspec.json.encode(whole[name][:2])
     assert not list(tmp_path.rglob("*.part"))
 
 
-def test_rows_do_not_depend_on_the_blocks(suite, rows, tmp_path):
-    made, _ = evaluate(load_suite(suite), NAMES, work=tmp_path, jobs=2, progress=False, block=5)
-    for name, row in made.items():
-        before = leaderboard.read_row(leaderboard.row_path(rows, "small", name))
-        assert row.metrics["per_sample"]["confusion"] == before.metrics["per_sample"]["confusion"]
-        assert [o.onsets for o in row.outcomes] == [o.onsets for o in before.outcomes]
+def test_rows_do_not_depend_on_blocks_and_workers(small, found, tmp_path):
+    again = evaluate(load_suite(str(small)), NAMES, work=tmp_path, jobs=2, progress=False, block=5)
+    for name, one in again.items():
+        assert one.outcomes == found[name].outcomes
+        assert one.row == found[name].row
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_verify_runs_episodes_again(small_suites, rows, name):
-    assert leaderboard.verify(leaderboard.row_path(rows, "small", name), share=0.3) == 4
+def test_within_a_block_the_quickest_method_comes_first(small, tmp_path, monkeypatch):
+    order = []
+    real = evaluation.diagnose
+
+    def watched(suite, plant, name, episodes, record):
+        order.append((episodes.start, name))
+        return msgspec.structs.replace(real(suite, plant, name, episodes, record), seconds={"null": 1.0}.get(name, 9.0))
+
+    monkeypatch.setattr(evaluation, "diagnose", watched)
+    evaluate(load_suite(str(small)), ["random", "null"], work=tmp_path, block=4, **QUIET)
+    assert order == [(0, "random"), (0, "null"), (4, "null"), (4, "random"), (8, "null"), (8, "random")]
 
 
-EDITS = [
-    (("metrics", "per_sample", "balanced_accuracy"), 0.999, "metrics.per_sample.balanced_accuracy"),
-    (("metrics", "per_episode", "balanced_accuracy_interval", 0), 0.98, "balanced_accuracy_interval"),
-    (("metrics", "false_alarms_per_hour"), 0.01, "metrics.false_alarms_per_hour"),
-    (("metrics", "rmse", "during", "b_rudder"), 0.001, "metrics.rmse.during.b_rudder"),
-    (("metrics", "accuracy_by_severity", "small", "per_sample"), 1.0, "metrics.accuracy_by_severity.small.per_sample"),
-    (("outcomes", 3, "false_alarms"), 55, "metrics.false_alarms_per_hour"),
-    (("summary",), "the best", "was edited"),
-    (("suite_sha256",), "0" * 64, "of the suite"),
-]
+# -- suites
 
 
-@pytest.mark.parametrize(("path", "value", "named"), EDITS, ids=[".".join(map(str, e[0])) for e in EDITS])
-def test_an_edited_row_is_named_and_refused(small_suites, rows, tmp_path, path, value, named):
-    source = leaderboard.row_path(rows, "small", "two_stage_kf_exponential")
-    content = json.loads(source.read_text())
-    place = content
-    for key in path[:-1]:
-        place = place[key]
-    assert place[path[-1]] != value
-    place[path[-1]] = value
-    edited = tmp_path / "row.json"
-    edited.write_text(json.dumps(content))
-    with pytest.raises(leaderboard.RefusedError, match=named):
-        leaderboard.verify(edited)
-
-
-def test_a_row_forged_as_a_whole_fails_when_it_is_run(small_suites, rows, tmp_path):
-    """All figures consistent, digests right, but the episodes are not what the diagnoser does."""
-    honest = leaderboard.read_row(leaderboard.row_path(rows, "small", "known_onset_oracle"))
-    forged = msgspec.structs.replace(honest, diagnoser="two_stage_kf_exponential", clairvoyant=False)
-    forged = msgspec.structs.replace(forged, sha256=forged.content_sha256())
-    path = tmp_path / "forged.json"
-    path.write_bytes(msgspec.json.encode(forged))
-    with pytest.raises(leaderboard.RefusedError, match=r"outcomes\[\d+\]"):
-        leaderboard.verify(path, share=0.5)
-
-
-def test_a_frozen_suite_cannot_be_edited(suite, tmp_path):
-    content = json.loads(Path(suite).read_text())
+def test_a_frozen_suite_cannot_be_edited(small, tmp_path):
+    content = json.loads(small.read_text())
     content["episodes"] = 3
     edited = tmp_path / "small.json"
     edited.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match="edited after it was frozen"):
+    with pytest.raises(RefusedError, match="edited after it was frozen"):
         load_suite(str(edited))
     with pytest.raises(ValueError, match="choose another name"):
-        freeze(msgspec.structs.replace(load_suite(suite), episodes=3), Path(suite).parent)
+        freeze(msgspec.structs.replace(load_suite(str(small)), episodes=3), small.parent)
 
 
-def run_cli(capsys, *arguments):
-    with pytest.raises(SystemExit) as stop:
-        cli.main(list(arguments))
-    return stop.value.code, capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"name": "../evil"}, "the name of a suite"), ({"name": "a/b"}, "the name of a suite"),
+        ({"episodes": 0}, "episodes is from 1"), ({"episodes": 10**9}, "episodes is from 1"),
+        ({"first_seed": -1}, "first_seed is from 0"), ({"mismatch": -0.1}, "mismatch is from 0"),
+        ({"mismatch": float("nan")}, "mismatch is from 0"), ({"description": "two\nlines"}, "one line"),
+        ({"settings": {"../x": {}}}, "the name of a diagnoser"), ({"process": "standrd"}, "did you mean standard"),
+        ({"plant": "B747"}, "unknown plant"), ({"options": {"variant": 3}}, "variant"),
+        ({"options": {"varient": "bare/closed"}}, "did you mean variant"), ({"env": "HUAVHover-Faults-v0"}, "HUAVHover"),
+        ({"env": "no_such_module:B747Lateral-Faults-v0"}, "cannot import no_such_module"),
+        ({"settings": {"null": {"speed": 1}}}, "unknown setting of null"),
+        ({"settings": {"nil": {}}}, "did you mean null"),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_suite_that_cannot_be_flown_is_not_frozen(small, tmp_path, change, words):
+    with pytest.raises(ValueError, match=words):
+        freeze(msgspec.structs.replace(load_suite(str(small)), **{"name": "other", **change}), tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
-def test_errors_of_the_command_line_are_one_clear_line(capsys, suite, rows, tmp_path):
-    code, said = run_cli(capsys, "evaluate", "b747-nonsense")
-    assert code == 2
-    assert "unknown suite 'b747-nonsense'; there are b747-" in said
-    code, said = run_cli(capsys, "evaluate", suite, "--diagnosers", "crystal_ball")
-    assert code == 2
-    assert "unknown diagnoser 'crystal_ball'" in said
-    assert "two_stage_kf" in said
-    code, said = run_cli(capsys, "evaluate", suite, "--diagnosers", "null", "--results", "/proc/nowhere")
-    assert code == 2
-    assert "cannot write results to /proc/nowhere" in said
-
-
-def test_a_row_of_another_suite_version_is_not_overwritten(capsys, suite, rows, tmp_path):
-    old = leaderboard.read_row(leaderboard.row_path(rows, "small", "null"))
-    folder = tmp_path / "small"
-    folder.mkdir()
-    path = folder / "null.json"
-    path.write_bytes(msgspec.json.encode(msgspec.structs.replace(old, suite_sha256="f" * 64)))
-    before = path.read_bytes()
-    code, said = run_cli(capsys, "evaluate", suite, "--diagnosers", "null", "--results", str(tmp_path))
-    assert code == 2
-    assert "another version of small" in said
-    assert path.read_bytes() == before
-    assert os.listdir(folder) == ["null.json"]
-
-
-def test_command_line_end_to_end(capsys, small_suites, suite, tmp_path):
-    results, page = tmp_path / "results", tmp_path / "page.md"
-    cli.main(["evaluate", "small", "--diagnosers", "null", "two_stage_kf", "--results", str(results), "--work",
-              str(tmp_path / "work"), "--jobs", "1"])  # fmt: skip
-    shown = capsys.readouterr().out
-    assert "| two_stage_kf " in shown
-    assert "rudder stuck" in shown
-    cli.main(["verify", str(results / "small" / "two_stage_kf.json")])
-    assert "same outcomes" in capsys.readouterr().out
-    cli.main(["leaderboard", "--results", str(results), "--page", str(page)])
-    assert page.read_text().count("| null") == 1
-
-
-def test_your_own_diagnoser_by_module_and_function(capsys, suite, tmp_path):
-    cli.main(["evaluate", suite, "--diagnosers", "baselines.trivial:null", "--work", str(tmp_path), "--jobs", "1"])
-    assert "baselines.trivial:null" in capsys.readouterr().out
-
-
-def test_list(capsys):
-    cli.main(["list"])
-    said = capsys.readouterr().out
-    for name in ("B747Lateral-Faults-v0", "b747-standard", "two_stage_kf_directional"):
-        assert name in said
-    cli.main(["list", "B747Lateral"])
-    assert "gamma_rudder" in capsys.readouterr().out
-
-
-# -- what is committed
+def test_a_file_that_is_no_suite_is_not_overwritten(small, tmp_path):
+    (tmp_path / "small.json").write_text("mine")
+    with pytest.raises(RefusedError, match="is not a suite"):
+        freeze(load_suite(str(small)), tmp_path)
+    assert (tmp_path / "small.json").read_text() == "mine"
 
 
 @pytest.mark.parametrize("name", suite_names())
 def test_committed_suites_draw_what_they_were_frozen_with(name):
     frozen = load_suite(name)
     plant = frozen.build()
-    assert evaluation.scenarios_digest(frozen.scenarios(plant, range(frozen.episodes))) == frozen.scenarios_sha256
+    assert scenarios_digest(frozen.scenarios(plant, range(frozen.episodes))) == frozen.scenarios_sha256
     assert plant.env_id == frozen.env.rpartition(":")[2]
-
-
-def test_committed_page_is_what_the_rows_say():
-    """Renders the tables again, which checks every row on the way."""
-    assert leaderboard.render(ROOT / "leaderboards" / "results") == (ROOT / "leaderboards" / "README.md").read_text()
-
-
-def committed_rows():
-    return sorted(p for p in (ROOT / "leaderboards" / "results").rglob("*.json") if p.name != "timing.json")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("path", committed_rows(), ids=lambda p: f"{p.parent.name}-{p.stem}")
-def test_committed_rows_give_the_same_outcomes(path):
-    assert leaderboard.verify(path) >= 1
-
-
-def test_every_table_is_framed():
-    """Each suite with rows has its floor and its ceiling."""
-    for folder in (ROOT / "leaderboards" / "results").iterdir():
-        names = {path.stem for path in folder.glob("*.json")}
-        assert {"null", "random"} <= names
-        assert any(leaderboard.read_row(folder / f"{n}.json").clairvoyant for n in names - {"timing"}), folder.name
 
 
 def test_suite_seeds_are_public_test_seeds():
@@ -254,7 +159,74 @@ def test_suite_seeds_are_public_test_seeds():
         assert load_suite(name).first_seed >= 1_000_000
 
 
-def test_confusion_matrix_prints_percent_of_rows(rows, suite):
-    row = leaderboard.read_row(leaderboard.row_path(rows, "small", "null"))
-    text = leaderboard.confusion_table(row, [label.name for label in build("B747Lateral").labels])
+# -- the pages
+
+
+def test_committed_page_is_what_the_rows_say():
+    """Renders the tables again, which checks every row on the way."""
+    assert leaderboard.render(ROOT / "leaderboards" / "results") == (ROOT / "leaderboards" / "README.md").read_text()
+
+
+def test_every_committed_table_is_framed():
+    """A suite with rows has its floor and its ceiling."""
+    for folder in sorted((ROOT / "leaderboards" / "results").glob("*/")):
+        rows = leaderboard.read_rows(folder)
+        assert {"null", "random"} <= {row.diagnoser for row in rows}, folder.name
+        assert any(leaderboard.clairvoyant(row) for row in rows), folder.name
+
+
+def test_a_page_is_rendered_from_the_rows_that_are_there(small, found, tmp_path, monkeypatch):
+    monkeypatch.setattr(suite, "SUITES", small.parent)
+    assert leaderboard.render(tmp_path) == leaderboard.INTRODUCTION
+    write_rows(tmp_path, load_suite("small"), {name: found[name] for name in ("null", "known_onset_oracle")})
+    page = leaderboard.render(tmp_path)
+    assert page.index("| known_onset_oracle (knows the truth) |") < page.index("| null ")
+    write_rows(tmp_path, load_suite("small"), {"two_stage_kf_exponential": found["two_stage_kf_exponential"]})
+    assert leaderboard.render(tmp_path).count("\n| ") == page.count("\n| ") + 1
+    path = row_path(tmp_path, "small", "null")
+    path.rename(path.with_name("random.json"))
+    with pytest.raises(RefusedError, match="is the row of null"):
+        leaderboard.render(tmp_path)
+
+
+def test_text_from_files_is_shown_as_it_is():
+    text = "a | b `c` <script>d</script>\n# e * [f](g) \x1b[31m &lt;"
+    shown = leaderboard.plain(text)
+    assert "\n" not in shown
+    assert "\x1b" not in shown
+    assert "<" not in shown
+    for mark in "|`*[]":
+        assert shown.count(mark) == shown.count("\\" + mark) == text.count(mark)
+
+
+def test_confusion_matrix_prints_percent_of_rows(found):
+    text = leaderboard.confusion_table(found["null"].row, [label.name for label in build("B747Lateral").labels])
     assert np.isclose(float(text.splitlines()[2].split("|")[2]), 100.0)
+
+
+# -- the whole way, by the command line
+
+
+def test_command_line_end_to_end(capsys, small, tmp_path, monkeypatch):
+    monkeypatch.setattr(suite, "SUITES", small.parent)
+    results, page = tmp_path / "results", tmp_path / "page.md"
+    cli.main(["evaluate", "small", "--diagnosers", "null", "two_stage_kf", "--results", str(results), "--work",
+              str(tmp_path / "work"), "--jobs", "1"])  # fmt: skip
+    shown = capsys.readouterr().out
+    assert "| two_stage_kf " in shown
+    assert "rudder stuck" in shown
+    cli.main(["verify", *map(str, (results / "small").glob("*.json"))])
+    assert capsys.readouterr().out.count("same outcomes") == 2
+    cli.main(["leaderboard", "--results", str(results), "--page", str(page)])
+    assert page.read_text().count("| null") == 1
+
+
+def test_a_diagnoser_by_module_and_function(capsys, small, tmp_path):
+    cli.main(["evaluate", str(small), "--diagnosers", "baselines.trivial:null", "--work", str(tmp_path), "--jobs", "1"])
+    assert "baselines.trivial:null" in capsys.readouterr().out
+
+
+def test_the_folder_of_blocks_may_be_named_relatively(small, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    evaluate(load_suite(str(small)).head(1), ["null"], work=Path("runs"), **QUIET)
+    assert len(list(tmp_path.glob("runs/small-1-*/null-*/block-000000.json"))) == 1

@@ -11,26 +11,33 @@ import joblib
 import msgspec
 from tqdm import tqdm
 
-from fdi_gym.files import write_whole
+from fdi_gym.files import RefusedError, read_json, write_whole
 from fdi_gym.leaderboard import markdown
 
 __all__ = ["compared", "markdown", "pieces"]
 
 
 def pieces(folder: Path, jobs: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]], workers: int = -1) -> dict[str, Any]:
-    """Run named jobs in parallel; each result is one JSON file, and what is there already is not run again."""
+    """Run named jobs in parallel; each result is one JSON file, and what is there already, undamaged, is not run again."""
     folder.mkdir(parents=True, exist_ok=True)
 
     def one(name: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
         write_whole(folder / f"{name}.json", msgspec.json.encode(function(*arguments)))
 
-    missing = {name: job for name, job in jobs.items() if not (folder / f"{name}.json").exists()}
+    def there(name: str) -> bool:
+        try:
+            read_json(folder / f"{name}.json", object, "piece")
+        except RefusedError:  # there is none, or it is damaged
+            return False
+        return True
+
+    missing = {name: job for name, job in jobs.items() if not there(name)}
     if missing:
         parallel = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")
         tasks = (joblib.delayed(one)(name, *job) for name, job in missing.items())
         for _ in tqdm(parallel(tasks), total=len(missing), unit="piece"):
             pass
-    return {name: msgspec.json.decode((folder / f"{name}.json").read_bytes()) for name in jobs}
+    return {name: read_json(folder / f"{name}.json", object, "piece") for name in jobs}
 
 
 def compared(reference: float, found: float, error: float, digits: int = 3, tally: list[bool] | None = None) -> str:

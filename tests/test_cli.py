@@ -1,0 +1,324 @@
+"""The command line: whatever is typed gets an answer in words, never a traceback, and nothing is lost."""
+
+import importlib.metadata
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from conftest import PLANTS, ROOT
+
+from fdi_gym import __version__, cli, diagnosis, suite
+from fdi_gym.diagnosis import broken_plugins, diagnosers
+from fdi_gym.suite import Suite, freeze, load_suite, suite_names
+from fdi_gym.training import trainers
+
+FDI_GYM = [sys.executable, "-m", "fdi_gym.cli"]
+
+
+def said(capsys, *arguments):
+    """Exit status, standard output and standard error of a call."""
+    code = 0
+    try:
+        cli.main([str(a) for a in arguments])
+    except SystemExit as stop:
+        code = stop.code
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def refused(capsys, *arguments):
+    """The one line that says why a call is refused."""
+    code, _, err = said(capsys, *arguments)
+    lines = [line for line in err.splitlines() if line.startswith("fdi-gym: ")]
+    assert code == 2, (code, err)
+    assert len(lines) == 1, err
+    assert "Traceback" not in err
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    found = Suite(name="small", description="a test", env="B747Lateral-Faults-v0", plant="B747Lateral",
+                  options={"variant": "printed/open", "labels": "single"}, process="standard", mismatch=None,
+                  first_seed=300, episodes=4, settings={})  # fmt: skip
+    return freeze(found, tmp_path_factory.mktemp("suites"))
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """An empty current folder; the modules in it are forgotten afterwards."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    before = set(sys.modules)
+    yield tmp_path
+    for name in set(sys.modules) - before:
+        if str(tmp_path) in str(getattr(sys.modules[name], "__file__", "")):
+            del sys.modules[name]
+
+
+# -- names
+
+
+WRONG = [
+    (("evaluate", "b747-standrd"), "unknown suite 'b747-standrd'; did you mean b747-standard?"),
+    (("evaluate", "nowhere.json"), "there is no suite nowhere.json"),
+    (("evaluate", "."), "unknown suite"), (("evaluate", "../suites/x"), "unknown suite"),
+    (("evaluate", "b747-paper", "--diagnosers", "two_stage_kff"), "did you mean two_stage_kf?"),
+    (("evaluate", "b747-paper", "--diagnosers", "no_such_module:build"), "cannot import no_such_module"),
+    (("evaluate", "b747-paper", "--diagnosers", "json:nothing"), "json has no function 'nothing'"),
+    (("evaluate", "b747-paper", "--diagnosers", "json:__name__"), "json has no function '__name__'"),
+    (("evaluate", "b747-paper", "--diagnosers", "math:sin:cos"), "names something in a module"),
+    (("evaluate", "b747-paper", "--diagnosers", "..:f"), "names something in a module"),
+    (("evaluate", "b747-paper", "--diagnosers", ":"), "names something in a module"),
+    (("evaluate", "b747-paper", "--diagnosers", "null", "--jobs", "0"), "jobs is 1 or more, or -1"),
+    (("evaluate", "b747-paper", "--diagnosers", "null", "--jobs", "-3"), "jobs is 1 or more, or -1"),
+    (("evaluate", "b747-paper", "--diagnosers", "null", "--results", "/proc/none"), "cannot write results to /proc/none"),
+    (("evaluate", "b747-paper", "--diagnosers", "mekf"), "none of these diagnosers can run on B747Lateral"),
+    (("verify",), "there are no rows"), (("verify", "results/made.json"), "there are no rows"),
+    (("verify", "nowhere.json"), "nowhere.json is no file"), (("verify", "/dev/zero"), "/dev/zero is no file"),
+    (("verify", "."), "is no file"), (("verify", "x.json", "--share", "2"), "share is above 0 and up to 1"),
+    (("verify", "x.json", "--share", "0"), "share is above 0 and up to 1"),
+    (("verify", "x.json", "--seed", "-1"), "seed is 0 or more"),
+    (("leaderboard", "--results", "nowhere", "--page", "nowhere/page.md"), "cannot write nowhere/page.md"),
+    (("list", "B747Latera"), "did you mean B747Lateral"), (("list", "b747-papr"), "did you mean b747-paper"),
+    (("list", "sequence_nets"), "did you mean sequence_net"), (("list", "no_such_module:x"), "cannot import no_such_module"),
+    (("list", "B747Lateral-Faults-v9"), "mean B747Lateral-Faults-v0"), (("list", "nowhere.json"), "there is no suite"),
+    (("freeze", "../evil", *(standard := ("--plant", "HUAVHover", "--process", "standard", "--description", "d")),
+      "--episodes", "1"), "the name of a suite"),
+    (("freeze", "x", *standard, "--episodes", "0"), "episodes is from 1 to"),
+    (("freeze", "x", *standard, "--episodes", "1", "--first-seed", "-1"), "first_seed is from 0"),
+    (("freeze", "x", *standard, "--episodes", "1", "--mismatch", "nan"), "mismatch is from 0 to 1"),
+    (("freeze", "x", *standard, "--episodes", "1", "--options", "kapa", "0.5"), "did you mean kappa?"),
+    (("freeze", "x", *standard, "--episodes", "1", "--options", "kappa", "much"), "kappa of HUAVHover: Expected `float`"),
+    (("freeze", "x", *standard, "--episodes", "1", "--options", "kappa", "nan"), "a finite number"),
+    (("freeze", "x", *standard, "--episodes", "1", "--settings", "{"), "--settings is not JSON"),
+    (("freeze", "x", *standard, "--episodes", "1", "--settings", '{"nul": {}}'), "did you mean null"),
+    (("freeze", "x", "--plant", "HUAVHovr", *standard[2:], "--episodes", "1"), "did you mean HUAVHover"),
+    (("freeze", "x", "--plant", "HUAVHover", "--process", "hrad", "--description", "d", "--episodes", "1"), "mean hard"),
+    (("train", "sequence_nett", "B747Lateral"), "did you mean sequence_net?"),
+    (("train", "sequence_net", "B747"), "unknown plant 'B747'; did you mean B747Lateral?"),
+    (("train", "sequence_net", "B747Lateral", "--budget", "0"), "budget is 1 or more, not 0"),
+    (("train", "sequence_net", "B747Lateral", "--seed", "-1"), "seed is 0 or more, not -1"),
+    (("train", "sequence_net", "B747Lateral", "--threads", "0"), "threads is 1 or more, not 0"),
+    (("train", "json:dumps", "B747Lateral"), "json:dumps failed: TypeError"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "words"), WRONG, ids=[" ".join(a)[:60] for a, _ in WRONG])
+def test_what_is_wrong_is_one_line_that_says_what_is_right(capsys, here, arguments, words):
+    assert words in refused(capsys, *arguments, *(["--folder", "."] if arguments[0] == "freeze" else []))
+    assert not list(here.glob("*.json"))
+
+
+@pytest.mark.parametrize("arguments", [(), ("evalute",), ("evaluate",), ("evaluate", "x", "--jobs", "two"), ("freeze", "x"),
+                                       ("evaluate", "x", "--confusion", "some"), ("list", "a", "b")], ids=str)  # fmt: skip
+def test_usage_errors_have_status_2(capsys, here, arguments):
+    code, _, err = said(capsys, *arguments)
+    assert code == 2
+    assert err.strip()
+    assert "Traceback" not in err
+
+
+# -- your own code
+
+
+BUILDERS = {
+    "raises": ("def build(plant):\n    return 1 / 0", "builder of own:build failed: ZeroDivisionError: .*own.py, line 2"),
+    "returns None": ("def build(plant):\n    pass", "the builder of own:build gives NoneType, not a Diagnoser"),
+    "returns a number": ("def build(plant):\n    return 3", "the builder of own:build gives int, not a Diagnoser"),
+    "takes nothing": ("def build():\n    pass", "own:build is no builder of a diagnoser: it takes no plant"),
+    "takes more": ("def build(plant, other):\n    pass", "the builder of own:build failed: TypeError: .*'other'"),
+    "refuses": ("def build(plant):\n    raise ValueError('not today')", "own:build: not today"),
+    "exits": ("raise SystemExit(0)", "cannot import own: SystemExit"),
+    "no Python": ("def build(", "cannot import own: SyntaxError: .*own.py, line 1"),
+    "import fails": ("import no_such_thing", "cannot import own: No module named 'no_such_thing'"),
+    "fails later": ("from fdi_gym.diagnosis import Diagnoser\ndef build(plant):\n"
+                    "    return Diagnoser(lambda n: (), lambda s, y: {}['x'])", "own:build failed: KeyError: 'x' .*line 3"),
+    "no batch": ("from fdi_gym.diagnosis import Diagnoser\ndef build(plant):\n"
+                 "    return Diagnoser(lambda: (), lambda s, y: s)", "own:build failed: TypeError"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BUILDERS)
+def test_a_builder_that_is_none_is_named(capsys, here, small, case):
+    code, words = BUILDERS[case]
+    (here / "own.py").write_text(code)
+    line = refused(capsys, "evaluate", small, "--diagnosers", "own:build", "--jobs", "1")
+    assert re.search(words, line), line
+
+
+def test_a_diagnoser_in_the_current_folder_is_found_in_every_worker(here, small):
+    (here / "own.py").write_text("from baselines.trivial import null as build\n")
+    command = [*FDI_GYM, "evaluate", str(small), "--diagnosers", "own:build", "--jobs", "2", "--results", "results"]
+    done = subprocess.run(command, cwd=here, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "own:build" in done.stdout
+    assert (here / "results" / "small" / "own.build.json").exists()
+
+
+def test_the_commands_of_the_examples_work(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT / "examples")
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p != str(ROOT / "examples")])
+    code, out, err = said(capsys, "list", "dc_motor:DCMotor")
+    assert code == 0, err
+    assert "DCMotor-Faults-v0" in out
+    name = "02_write_a_diagnoser:mean_innovation_test"
+    code, out, err = said(capsys, "list", name)
+    assert code == 0, err
+    assert "memory" in out
+    assert "did you mean DCMotor?" in refused(capsys, "train", "sequence_net", "dc_motor:DCMotors")
+    options = ("--process", "standard", "--description", "d", "--episodes", "1", "--folder", tmp_path)
+    assert said(capsys, "freeze", "motor", "--plant", "dc_motor:DCMotor", *options)[0] == 0
+    assert load_suite(str(tmp_path / "motor.json")).env == "dc_motor:DCMotor-Faults-v0"
+
+
+# -- freeze
+
+
+def test_options_are_of_the_types_that_the_plant_declares(capsys, here):
+    code, out, err = said(
+        capsys, "freeze", "own", "--plant", "HUAVHover-Faults-v0", "--process", "standard", "--description", "d",
+        "--episodes", "1", "--options", "kappa", "0.5", "--settings", '{"three_stage_cdkf": {"channels": ["lon"]}}',
+        "--folder", here,
+    )  # fmt: skip
+    assert code == 0, err
+    frozen = load_suite(out.strip())
+    assert frozen.options["kappa"] == 0.5
+    assert frozen.build().options["kappa"] == 0.5
+    assert frozen.settings == {"three_stage_cdkf": {"channels": ["lon"]}}
+
+
+# -- list
+
+
+def test_list_names_everything(capsys):
+    code, out, _ = said(capsys, "list")
+    assert code == 0
+    words = out.split()
+    for name in (*suite_names(), *diagnosers(), *trainers(), *(f"{p}-Faults-v0" for p in PLANTS)):
+        assert name in words
+    assert "broken:" not in out.lower()
+    assert "Broken plug-ins" not in out
+
+
+THINGS = [
+    *PLANTS,
+    *(f"{p}-Faults-v0" for p in PLANTS),
+    *suite_names(),
+    *sorted(trainers()),
+    "two_stage_kf",
+    "known_onset_oracle",
+]
+
+
+@pytest.mark.parametrize("name", THINGS)
+def test_list_says_all_about_one_thing(capsys, name):
+    code, out, err = said(capsys, "list", name)
+    assert code == 0, err
+    assert name.split("-Faults")[0] in out
+    wanted = []
+    if name in diagnosers():
+        wanted += ["settings", *PLANTS]
+    if name in suite_names():
+        wanted += [load_suite(name).process, f"fdi-gym evaluate {name}"]
+    if name in trainers():
+        wanted += [f"fdi-gym train {name} PLANT"]
+    for words in wanted or ["fault modes", "labels"]:
+        assert words in out
+
+
+def test_nothing_that_ships_is_broken():
+    assert broken_plugins() == {}
+
+
+def test_what_is_broken_does_not_stop_list(capsys, here, small, monkeypatch):
+    (here / "broken_plugin.py").write_text("1 / 0")
+    (here / "good_plugin").mkdir()
+    (here / "good_plugin" / "__init__.py").write_text("")
+    (here / "good_plugin" / "bad.py").write_text("import")
+    monkeypatch.syspath_prepend(str(here))
+    (here / "small.json").write_bytes(small.read_bytes())
+    (here / "empty.json").write_text("")
+    (here / "deep.json").write_text("[" * 100_000)
+    monkeypatch.setattr(suite, "SUITES", here)
+    points = [importlib.metadata.EntryPoint(f"p{i}", value, "fdi_gym.diagnosers")
+              for i, value in enumerate(("broken_plugin", "good_plugin", "missing", "baselines.trivial"))]  # fmt: skip
+    monkeypatch.setattr(diagnosis, "entry_points", lambda group: points)
+    broken_plugins.cache_clear()
+    try:
+        code, out, err = said(capsys, "list")
+        assert code == 0, err
+        for words in ("small ", "null ", "empty ", "deep ", "broken: ", "broken_plugin ", "ZeroDivisionError",
+                      "good_plugin.bad", "SyntaxError", "missing "):  # fmt: skip
+            assert words in out
+    finally:
+        broken_plugins.cache_clear()
+
+
+def test_listing_and_evaluating_do_not_import_what_is_slow(here, small):
+    code = (
+        "import sys; from fdi_gym import cli; cli.main(['list']); "
+        f"cli.main(['evaluate', {str(small)!r}, '--diagnosers', 'windowed_nis', '--jobs', '1']); "
+        "slow = {'scipy.stats', 'torch', 'matplotlib'} & set(sys.modules); assert not slow, slow"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=here, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+
+
+# -- how it ends
+
+
+def test_version(capsys):
+    assert said(capsys, "--version") == (0, f"fdi-gym {__version__}\n", "")
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_help_says_what_a_word_stands_for(capsys, command):
+    code, out, _ = said(capsys, command, "--help")
+    assert code == 0
+    assert not re.search(r"\bSTR\b", out)
+    assert {"evaluate": "SUITE", "verify": "ROW", "leaderboard": "PATH", "list": "NAME", "freeze": "PLANT",
+            "train": "METHOD"}[command] in out  # fmt: skip
+
+
+@pytest.mark.parametrize("arguments", [("list",), ("--help",), ("list", "B747Lateral"), ("list", "nothing")], ids=" ".join)
+def test_a_closed_pipe_is_silent(arguments):
+    command = subprocess.Popen([*FDI_GYM, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    command.stdout.close()
+    err = command.stderr.read().decode()
+    command.stderr.close()
+    assert command.wait(60) in ((2,) if "nothing" in arguments else (141,))
+    assert err.count("\n") <= 1
+    assert "Traceback" not in err
+    assert "Exception" not in err
+
+
+def test_an_interruption_is_one_line_and_status_130(tmp_path, small):
+    run = subprocess.Popen(
+        [*FDI_GYM, "evaluate", "b747-standard", "--diagnosers", "random", "--jobs", "2", "--work", str(tmp_path)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True, cwd=tmp_path,
+    )  # fmt: skip
+    for _ in range(1200):
+        if list(tmp_path.rglob("block-*.json")) or run.poll() is not None:
+            break
+        time.sleep(0.05)
+    os.killpg(run.pid, signal.SIGINT)
+    _, err = run.communicate(timeout=60)
+    assert run.returncode == 130, err
+    assert "fdi-gym: interrupted" in err
+    assert "Traceback" not in err
+
+
+def test_rows_that_would_be_lost_are_named(capsys, here, small):
+    evaluated = ("evaluate", small, "--diagnosers", "null", "--results", "results", "--jobs", "1")
+    assert said(capsys, *evaluated)[0] == 0
+    path = here / "results" / "small" / "null.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content))
+    assert "is not written as rows are" in refused(capsys, *evaluated)
+    assert json.loads(path.read_text()) == content
