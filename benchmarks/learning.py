@@ -19,7 +19,7 @@ from fdi_gym.envs import FDIEnv
 from fdi_gym.faults import draw
 from fdi_gym.plant import load_plant, plant_sources
 from fdi_gym.sb3 import FDIVecEnv, make_vec_env
-from fdi_gym.simulation import simulate
+from fdi_gym.engine import simulate
 from fdi_gym.wrappers import DelayAwareReward, VectorHistory
 
 DIAGNOSERS = ("sequence_net", "residual_net", "ppo")

@@ -12,7 +12,7 @@ from fdi_gym.diagnosis import run
 from fdi_gym.faults import draw
 from fdi_gym.plant import load_plant
 from fdi_gym.sb3 import FDIVecEnv
-from fdi_gym.simulation import simulate
+from fdi_gym.engine import simulate
 from fdi_gym.wrappers import DelayAwareReward, VectorHistory
 
 parser = argparse.ArgumentParser()

@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.plant import Array, Plant, Signal, load_plant
-from fdi_gym.simulation import Record, simulate
+from fdi_gym.engine import Record, simulate
 
 TASKS = ("isolation", "identification")
 UNITS = ("physical", "scaled")

@@ -16,7 +16,7 @@ import numpy as np
 from fdi_gym.diagnosis import Decisions
 from fdi_gym.faults import Scoring
 from fdi_gym.plant import Array, Plant
-from fdi_gym.simulation import Record
+from fdi_gym.engine import Record
 
 PHASES = ("before", "during", "after")  # before the first fault, while a fault acts, healthy again after one
 BANDS = ("small", "medium", "large")

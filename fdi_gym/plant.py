@@ -152,7 +152,7 @@ class Plant:
             to a singularity; diagnosers never see them.
         tuning: Settings of diagnosers, by name, that suit this plant better than what they find for themselves, such as
             those of its paper; what a caller gives overrides them.
-        noise: Draws (w (steps, n_x), v (steps + 1, n_y)) from a Generator. Default: white, row by row, v before w.
+        noise_limit: The white noise of sensors and states is clipped at so many standard deviations. Default: never.
         isolation_reward: (labels, labels): reward of declaring column while row is true. Default: 1 if right, else 0.
         identification_reward: Reward of an error (..., n). Default: minus the squares, scaled.
     """
@@ -186,7 +186,7 @@ class Plant:
     measured_disturbance: Callable[[float, Array, Array], Array] | None = None
     monitor: Callable[[Array], Mapping[str, Array]] = _nothing
     tuning: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    noise: Callable[[np.random.Generator, int], tuple[Array, Array]] | None = None
+    noise_limit: float = np.inf
     isolation_reward: Array | None = None
     identification_reward: Callable[[Array], Array] | None = None
 
@@ -205,6 +205,15 @@ class Plant:
             object.__setattr__(self, "isolation_reward", np.eye(len(self.labels)))
         if self.identification_reward is None:
             object.__setattr__(self, "identification_reward", squared_error([s.scale for s in self.estimated]))
+
+    def validate(self, scenario: FaultScenario) -> None:
+        """Raise ValueError where the scenario does not belong to this plant."""
+        if scenario.plant != self.id:
+            raise ValueError(f"the scenario belongs to {scenario.plant}, not to {self.id}")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the addresses of compiled functions, which hold in one process only."""
+        return {name: value for name, value in vars(self).items() if name != "addresses"}
 
     # -- derived facts, computed from the declaration and nothing else
 
@@ -263,12 +272,21 @@ class Plant:
     def label_rows(self, scenario: FaultScenario) -> Array:
         """The true label at the samples 0..K: sample k has that of the fault which acted over [k - 1, k)."""
         rows = np.zeros(scenario.steps + 1, dtype=np.int64)
-        ends = [scenario.steps if f.end is None else min(f.end, scenario.steps) for f in scenario.faults]
-        edges = sorted({0, scenario.steps, *(min(f.onset, scenario.steps) for f in scenario.faults), *ends})
-        for start, stop in itertools.pairwise(edges):
-            active = frozenset(f.mode for f, end in zip(scenario.faults, ends, strict=True) if f.onset <= start < end)
-            rows[start + 1 : stop + 1] = self.label_of(active)
+        for first, label in self.label_changes(scenario):
+            rows[first:] = label
         return rows
+
+    def label_changes(self, scenario: FaultScenario) -> list[tuple[int, int]]:
+        """The true label as (first sample, label), in order: sample k has that of the fault which acted over [k - 1, k)."""
+        steps = scenario.steps
+        spans = [(min(f.onset, steps), steps if f.end is None else min(f.end, steps), f.mode) for f in scenario.faults]
+        edges = sorted({0, *(edge for start, end, _ in spans for edge in (start, end))} - {steps})
+        changes = [(0, 0)]
+        for edge in edges:
+            label = self.label_of(frozenset(mode for start, end, mode in spans if start <= edge < end))
+            if label != changes[-1][1]:
+                changes.append((edge + 1, label))
+        return changes
 
     def theta_table(self, scenario: FaultScenario) -> ThetaTable:
         """What the scenario makes of theta (see `fdi_gym.faults.theta_table`)."""
@@ -340,31 +358,31 @@ class Plant:
         episode share their command). t [s] is a number or one per such group. theta, d and the physical parameters p
         default to nominal, none and the model's.
         """
-        from fdi_gym import kernels
+        from fdi_gym import integration
 
         x = np.asarray(x, float)
         rows = self._rows_of(t, x, u, theta, d, p, len(self.states))
-        kernels.propagate(self.addresses[0], self.addresses[4], self.dt, self.substeps, *rows)
+        integration.propagate(self.addresses[0], self.addresses[4], self.dt, self.substeps, *rows)
         return rows[-1].reshape(x.shape)
 
     def measure(
         self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None, p: Array | None = None
     ) -> Array:
         """The noise-free sensor values at x (..., n_x); arguments as in `propagate`, u held up to t."""
-        from fdi_gym import kernels
+        from fdi_gym import integration
 
         x = np.asarray(x, float)
         rows = self._rows_of(t, x, u, theta, d, p, len(self.outputs))
-        kernels.evaluate(self.addresses[1], *rows)
+        integration.evaluate(self.addresses[1], *rows)
         return rows[-1].reshape(*x.shape[:-1], len(self.outputs))
 
     def derivative(self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None) -> Array:
         """xdot at x (..., n_x); arguments as in `propagate`. For a discrete plant it is the next state."""
-        from fdi_gym import kernels
+        from fdi_gym import integration
 
         x = np.asarray(x, float)
         rows = self._rows_of(t, x, u, theta, d, None, len(self.states))
-        kernels.evaluate(self.addresses[0], *rows)
+        integration.evaluate(self.addresses[0], *rows)
         return rows[-1].reshape(x.shape)
 
     @functools.cached_property

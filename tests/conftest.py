@@ -12,7 +12,7 @@ import pytest
 from fdi_gym.estimation import calibration, unknown_inputs
 from fdi_gym.estimation.prior import flights_of
 from fdi_gym.plant import Plant, load_plant, plant_sources
-from fdi_gym.simulation import simulate
+from fdi_gym.engine import simulate
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "examples"))

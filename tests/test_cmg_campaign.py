@@ -21,7 +21,7 @@ from baselines.reproduction.cmg_statistics import Results
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
-from fdi_gym.simulation import simulate
+from fdi_gym.engine import simulate
 
 
 @pytest.fixture(scope="module")

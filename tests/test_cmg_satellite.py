@@ -10,7 +10,7 @@ import fdi_gym
 from fdi_gym.faults import Fault, FaultScenario, Samples, draw
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
-from fdi_gym.simulation import no_noise, simulate
+from fdi_gym.engine import no_noise, simulate
 
 DELTA = np.array([0.3, -0.2, 0.5, 0.1])
 Q = np.array([0.1, -0.2, 0.3, np.sqrt(0.86)])
@@ -220,10 +220,10 @@ def test_integration_order():
     r = np.array([[8.0, -6.0, 5.0, 7.0]])
 
     def end(substeps, h=0.08):
-        from fdi_gym import kernels
+        from fdi_gym import integration
 
         out = np.empty((1, 11))
-        kernels.propagate(plant.addresses[0], plant.addresses[4], h, substeps, np.zeros(1), x[None], r, F,
+        integration.propagate(plant.addresses[0], plant.addresses[4], h, substeps, np.zeros(1), x[None], r, F,
                           np.zeros((1, 0)), plant.nominal_p[None], out)  # fmt: skip
         return out[0]
 

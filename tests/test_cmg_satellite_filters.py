@@ -10,7 +10,7 @@ from fdi_gym.estimation.unscented import covariance, mean_and_deviations, sigma_
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
-from fdi_gym.simulation import simulate
+from fdi_gym.engine import simulate
 
 Q_V, W, DELTA = [0.1, -0.2, 0.3], [0.05, -0.02, 0.03], [0.3, -0.2, 0.5, 0.1]
 R_K = np.array([[0.2, -0.1, 0.15, 0.05]])

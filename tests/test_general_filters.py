@@ -37,7 +37,7 @@ from fdi_gym.estimation.prior import VALIDATION_SEED, flights_of, long_run, prio
 from fdi_gym.faults import draw
 from fdi_gym.plants import b747_lateral as b747_file
 from fdi_gym.plants import huav_hover
-from fdi_gym.simulation import simulate
+from fdi_gym.engine import simulate
 
 ALL_PLANTS = [*PLANTS, "DCMotor"]
 SMALL = 5e-3

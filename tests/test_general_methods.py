@@ -16,7 +16,7 @@ from fdi_gym.estimation.augmented import augmented
 from fdi_gym.estimation.linear import linear_model
 from fdi_gym.estimation.prior import flights_of
 from fdi_gym.faults import draw
-from fdi_gym.simulation import no_noise, simulate
+from fdi_gym.engine import no_noise, simulate
 
 FLIGHTS = 3
 

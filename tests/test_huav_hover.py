@@ -11,7 +11,7 @@ import fdi_gym  # noqa: F401 (registers the environments)
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import huav_hover as huav
-from fdi_gym.simulation import no_noise, simulate
+from fdi_gym.engine import no_noise, simulate
 
 KAPPAS = (0.0, 0.3, 1.0)
 X = np.array([0.5, -0.4, 0.3, 0.10, -0.20, 0.15, 0.12, -0.08, 0.50, 0.010, -0.020])

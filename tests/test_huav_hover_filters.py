@@ -23,7 +23,7 @@ from fdi_gym.faults import FaultProcess, FaultScenario
 from fdi_gym.kernels import kernel
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal, load_plant
 from fdi_gym.plants import b747_lateral, huav_hover
-from fdi_gym.simulation import no_noise, simulate
+from fdi_gym.engine import no_noise, simulate
 from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env
 
 X0_STD = huav_hover.X0_STD

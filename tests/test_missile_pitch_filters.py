@@ -18,7 +18,7 @@ from fdi_gym.estimation import missile_model as model
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import missile_pitch as missile
-from fdi_gym.simulation import simulate
+from fdi_gym.engine import simulate
 from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env
 
 NAMES = (

@@ -16,7 +16,7 @@ from fdi_gym.diagnosis import Diagnoser
 from fdi_gym.estimation.flags import largest
 from fdi_gym.estimation.propagation import FaultInputs
 from fdi_gym.plant import Array, Plant
-from fdi_gym.simulation import simulate
+from fdi_gym.engine import simulate
 
 MRAD = 1e-3
 CALIBRATION_SEEDS = range(5000, 5100)

@@ -31,7 +31,7 @@ from baselines.reproduction.tables import compared, markdown, pieces
 from fdi_gym.diagnosis import Decisions, make_diagnoser, run
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.plant import Array, Plant, load_plant
-from fdi_gym.simulation import Record, simulate
+from fdi_gym.engine import Record, simulate
 
 GROUPS = 20  # the reference's seeds, with 20 episodes each
 DT = 0.1

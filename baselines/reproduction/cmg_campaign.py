@@ -21,7 +21,7 @@ from fdi_gym.estimation.covariance_adaptation import BETA_0, MEMORY
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant, load_plant
 from fdi_gym.plants import cmg_satellite as cmg
-from fdi_gym.simulation import Record, simulate
+from fdi_gym.engine import Record, simulate
 
 METHODS = {
     "UKF": "joint_ukf", "CAUKF": "caukf", "GAUKF": "gaukf", "SGAUKF": "sgaukf", "SGAUKF-odd": "sgaukf_odd",

@@ -11,7 +11,7 @@ from baselines.reproduction.cmg_campaign import Piece, scenarios_of, table4_outc
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
-from fdi_gym.simulation import simulate, white_noise
+from fdi_gym.engine import simulate, white_noise
 
 AFTER = (100, 300, 1000, 3000)  # samples after the onset at which the bound is read
 # other readings of the data sheet's regulation at 75 dB: options of the plant, process noise, tuning of the filter

@@ -33,7 +33,7 @@ from fdi_gym.estimation.propagation import fault_inputs
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant, load_plant
 from fdi_gym.plants.huav_hover import CHANNELS, ID, disturbance_rows, episode, fault_free_episode, paper
-from fdi_gym.simulation import Record, simulate
+from fdi_gym.engine import Record, simulate
 
 DT, MRAD = 0.02, 1e-3
 SETS = {3: CHANNELS[1:], 4: CHANNELS}

@@ -35,7 +35,7 @@ from fdi_gym.estimation import missile_model as model
 from fdi_gym.faults import FaultScenario, Incipient, draw
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants import missile_pitch as missile
-from fdi_gym.simulation import simulate
+from fdi_gym.engine import simulate
 
 DT = missile.DT
 FIVE = (1, 2, 3, 4, 5)

@@ -535,6 +535,6 @@ def plant(*, kappa: float = 0.3, K_B: float = 0.84) -> Plant:
                for name in ("robust_three_stage_cdkf", "robust_three_stage_ekf", "hypothesis_bank")},
         },
         physical=physical, perturb=perturb,
-        noise=prescribed_noise, isolation_reward=np.eye(len(labels)) - 0.5 * wrongly,
+        isolation_reward=np.eye(len(labels)) - 0.5 * wrongly,
         identification_reward=identification_reward,
     )  # fmt: skip
