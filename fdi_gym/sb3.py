@@ -130,7 +130,7 @@ def make_vec_env(env_id: str, num_envs: int, seed: int | None = None, **argument
         env_id: Gymnasium id.
         num_envs: How many.
         seed: Of the first environment at the first reset; the next ones follow.
-        arguments: Of the environment (`units`, `decision_period`, `scenario`, ...).
+        arguments: Of the environment (`units`, `decision_period`, `process`, ...).
     """
     venv = FDIVecEnv(gym.make_vec(env_id, num_envs=num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **arguments))
     if seed is not None:

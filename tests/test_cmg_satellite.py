@@ -395,14 +395,14 @@ def test_environment(task):
 
 def test_info_reports_the_distance_to_a_singularity(plant):
     """info["det"] is det(A A') of the recorded state, in both environments, and diagnosers don't see it."""
-    env = gym.make("CMGSatellite-Faults-v0", scenario="hard")
+    env = gym.make("CMGSatellite-Faults-v0", process="hard")
     _, info = env.reset(seed=4)
     infos = [info, *(env.step(0)[4] for _ in range(300))]
     state = simulate(plant, [env.unwrapped.scenario]).state[0, :301]
     A, _ = cmg.cluster(state[:, 7:])
     assert [i["det"] for i in infos] == cmg.singularity(state[:, 7:]).tolist()
     close([i["det"] for i in infos], np.linalg.det(A @ np.swapaxes(A, 1, 2)))
-    many = gym.make_vec("fdi_gym:CMGSatellite-Faults-v0", num_envs=2, scenario="hard")
+    many = gym.make_vec("fdi_gym:CMGSatellite-Faults-v0", num_envs=2, process="hard")
     many.reset(seed=[4, 5])
     for k in range(1, 30):
         assert many.step(np.zeros(2, int))[4]["det"][0] == infos[k]["det"]

@@ -85,7 +85,7 @@ def test_scaled_units():
 
 
 def test_a_scenario_is_replayed_with_its_noise():
-    first = FDIEnv("B747Lateral", scenario="hard")
+    first = FDIEnv("B747Lateral", process="hard")
     rows, _, _, _ = play(first, lambda info: 0, seed=9)
     text = first.scenario.to_json()
     for scenario in (text, FaultScenario.from_json(text)):
@@ -115,7 +115,7 @@ def test_mismatch_changes_the_truth_and_not_the_model():
 
 BAD = [
     ({"task": "prediction"}, "isolation, identification"),
-    ({"scenario": "easy"}, "standard"),
+    ({"process": "easy"}, "standard"),
     ({"units": "furlongs"}, "physical, scaled"),
     ({"decision_period": 0}, "at least 1"),
     ({"render_mode": "ascii"}, "rgb_array"),

@@ -44,7 +44,7 @@ def test_rows_agree_with_playing_the_environment(suite, rows):
     """The same seeds through gym's interface give the same labels, sample by sample."""
     frozen = load_suite(suite)
     row = leaderboard.read_row(leaderboard.row_path(rows, "small", "two_stage_kf_exponential"))
-    env = FDIEnv(frozen.plant, scenario=frozen.scenario, **frozen.options)
+    env = FDIEnv(frozen.plant, process=frozen.scenario, **frozen.options)
     diagnoser = make_diagnoser("two_stage_kf_exponential", env.plant)
     for i in (0, 5):
         obs, info = env.reset(seed=frozen.first_seed + i)

@@ -428,7 +428,7 @@ def test_plant_conformance(plant):
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"task": "identification", "units": "scaled"},
-                                    {"decision_period": 5, "mismatch": 0.02, "scenario": "hard"}])  # fmt: skip
+                                    {"decision_period": 5, "mismatch": 0.02, "process": "hard"}])  # fmt: skip
 def test_vector_env_conformance(plant, kwargs):
     check_vector_env(plant, n=3, steps=120, **kwargs)
 
