@@ -17,9 +17,9 @@ import scipy.linalg
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from fdi_gym.diagnosis import find_diagnoser
+from fdi_gym.engine import simulate
 from fdi_gym.plant import load_plant
 from fdi_gym.plants.huav_hover import DT, X0_STD, dynamics, episode
-from fdi_gym.engine import simulate
 
 NAMES = ("ascdkf", "three_stage_cdkf", "three_stage_ekf", "robust_three_stage_cdkf", "robust_three_stage_ekf",
          "hypothesis_bank")  # fmt: skip

@@ -54,7 +54,7 @@ class Chunk(NamedTuple):
 
 
 def white_noise(plant: Plant, rng: np.random.Generator, steps: int) -> tuple[Array, Array]:
-    """Process noise w (steps, n_x) and sensor noise v (steps + 1, n_y) from a generator, to be injected: numbered flights."""
+    """Process noise w (steps, n_x) and sensor noise v (steps + 1, n_y) from a generator, to be injected."""
     v = rng.standard_normal((steps + 1, len(plant.outputs)))
     w = rng.standard_normal((steps, len(plant.states)))
     v *= [s.sigma for s in plant.outputs]
@@ -144,7 +144,9 @@ class Flights:
             plant.validate(scenario)
             steps = scenario.steps
             reference = contiguous(plant.reference(scenario))
-            disturbance = plant.disturbance(scenario) if plant.disturbance else np.zeros((steps + 1, len(plant.disturbances)))
+            disturbance = (
+                plant.disturbance(scenario) if plant.disturbance else np.zeros((steps + 1, len(plant.disturbances)))
+            )
             self.widths[:] = reference.shape[1], disturbance.shape[1]
             given: tuple[Array | None, Array | None] = (None, None)
             if noise is not None:
@@ -261,7 +263,9 @@ def advance(
     sensors = _optional("sensors", sensors, (samples, n, n_y, FAULTS))
     lags = sensors[..., closed_loop.LAG]
     if lags.size and (lags.min() < 0 or lags.max() > max(flights.history.shape[1] - 1, 0)):
-        raise ValueError(f"a sensor lags by 0 to {max(flights.history.shape[1] - 1, 0)} samples (longest_lag of the flights)")
+        raise ValueError(
+            f"a sensor lags by 0 to {max(flights.history.shape[1] - 1, 0)} samples (longest_lag of the flights)"
+        )
     arguments = (
         *plant.addresses, plant.dt, plant.substeps, int(plant.true_feedback), plant.nominal_theta, contiguous(plant.q),
         *_signals(flights), *flights.arrays(),

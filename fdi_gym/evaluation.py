@@ -22,10 +22,10 @@ import msgspec
 from tqdm import tqdm
 
 from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, make_diagnoser, run, told
+from fdi_gym.engine import simulate
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.metrics import Outcome, outcome, summarise
 from fdi_gym.plant import Plant, load_plant
-from fdi_gym.engine import simulate
 
 BLOCK = 50  # episodes flown and diagnosed together
 _PACKAGED = Path(__file__).parent / "suites"

@@ -35,7 +35,6 @@ from pathlib import Path
 from typing import Any
 
 import numba
-import numpy as np
 import platformdirs
 from numba import boolean, float64, int64, types, void
 from numba.core import caching, cgutils, config

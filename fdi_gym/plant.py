@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
-import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence

@@ -16,10 +16,10 @@ from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from fdi_gym.diagnosis import Decisions, Diagnoser, guarded, run
+from fdi_gym.engine import Record, no_noise, simulate
 from fdi_gym.envs import FDIEnv, FDIVectorEnv
 from fdi_gym.faults import FaultScenario, draw, streams
 from fdi_gym.plant import Array, Plant
-from fdi_gym.engine import Record, no_noise, simulate
 
 
 def check_plant(plant: Plant, seeds: Sequence[int] = range(5)) -> None:

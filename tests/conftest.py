@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from fdi_gym.engine import simulate
 from fdi_gym.estimation import calibration, unknown_inputs
 from fdi_gym.estimation.prior import flights_of
 from fdi_gym.plant import Plant, load_plant, plant_sources
-from fdi_gym.engine import simulate
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "examples"))

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import fdi_gym
+from fdi_gym.engine import no_noise, simulate
 from fdi_gym.faults import Fault, FaultScenario, Samples, draw
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
-from fdi_gym.engine import no_noise, simulate
 
 DELTA = np.array([0.3, -0.2, 0.5, 0.1])
 Q = np.array([0.1, -0.2, 0.3, np.sqrt(0.86)])

@@ -5,12 +5,12 @@ import pytest
 
 from baselines.filters.joint_ukf import step
 from fdi_gym.diagnosis import NotApplicableError, make_diagnoser, run
+from fdi_gym.engine import simulate
 from fdi_gym.estimation.covariance_adaptation import Trial, binary_grid, element_grid
 from fdi_gym.estimation.unscented import covariance, mean_and_deviations, sigma_points, weights
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
-from fdi_gym.engine import simulate
 
 Q_V, W, DELTA = [0.1, -0.2, 0.3], [0.05, -0.02, 0.03], [0.3, -0.2, 0.5, 0.1]
 R_K = np.array([[0.2, -0.1, 0.15, 0.05]])

@@ -10,6 +10,7 @@ import pytest
 from conftest import ROOT, build
 
 from fdi_gym import integration, kernels
+from fdi_gym.engine import no_noise, simulate, white_noise
 from fdi_gym.faults import (
     Abrupt,
     Fault,
@@ -26,7 +27,6 @@ from fdi_gym.faults import (
 )
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import b747_lateral as b747
-from fdi_gym.engine import no_noise, simulate, white_noise
 
 MOTOR = {"reference": {"levels": [100.0]}, "disturbance": {"load": 0.02}}
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from conftest import build
 
+from fdi_gym.engine import simulate
 from fdi_gym.envs import FDIEnv, FDIVectorEnv
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.plants import b747_lateral as b747
-from fdi_gym.engine import simulate
 
 
 def play(env, policy, seed=None):

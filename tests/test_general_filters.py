@@ -13,6 +13,7 @@ from scipy.stats import betabinom
 
 from baselines.filters import ascdkf, augmented_kf, two_stage_kf
 from fdi_gym.diagnosis import NotApplicableError, diagnosers, make_diagnoser, run
+from fdi_gym.engine import simulate
 from fdi_gym.estimation import calibration, unknown_inputs
 from fdi_gym.estimation import prior as prior_file
 from fdi_gym.estimation.alarm import (
@@ -37,7 +38,6 @@ from fdi_gym.estimation.prior import VALIDATION_SEED, flights_of, long_run, prio
 from fdi_gym.faults import draw
 from fdi_gym.plants import b747_lateral as b747_file
 from fdi_gym.plants import huav_hover
-from fdi_gym.engine import simulate
 
 ALL_PLANTS = [*PLANTS, "DCMotor"]
 SMALL = 5e-3

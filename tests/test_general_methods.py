@@ -11,12 +11,12 @@ from baselines.filters.sgaukf import sgaukf
 from baselines.filters.two_stage_kf import step as two_stage_kf_step
 from baselines.reproduction.consistency import measure, verdict
 from fdi_gym.diagnosis import make_diagnoser, run
+from fdi_gym.engine import no_noise, simulate
 from fdi_gym.estimation import gaussian, glr, multiple_model, two_stage
 from fdi_gym.estimation.augmented import augmented
 from fdi_gym.estimation.linear import linear_model
 from fdi_gym.estimation.prior import flights_of
 from fdi_gym.faults import draw
-from fdi_gym.engine import no_noise, simulate
 
 FLIGHTS = 3
 

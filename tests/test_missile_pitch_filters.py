@@ -13,12 +13,12 @@ from baselines.filters import augmented_ekf_imm as imm
 from baselines.filters import generalised_observer_scheme as isolation
 from baselines.filters import innovation_oracle as oracle
 from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, make_diagnoser, run
+from fdi_gym.engine import simulate
 from fdi_gym.estimation import missile_ekf as ekf
 from fdi_gym.estimation import missile_model as model
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import missile_pitch as missile
-from fdi_gym.engine import simulate
 from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env
 
 NAMES = (

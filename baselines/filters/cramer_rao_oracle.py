@@ -18,12 +18,12 @@ import scipy.special
 
 from baselines.filters.mekf import changes, first_covariance, observation, transition
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
+from fdi_gym.engine import simulate
 from fdi_gym.estimation.attitude import require_attitude
 from fdi_gym.estimation.kalman import T, right_divide, symmetric
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.cmg_satellite import SETS, SIGMA_Q
-from fdi_gym.engine import simulate
 
 P_PRIOR = 0.25  # variance of each effectiveness at a change
 Q_FLOOR = 1e-8  # rad/s per step: process noise of the bound where there is none

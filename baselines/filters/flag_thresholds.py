@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from fdi_gym.diagnosis import Diagnoser
+from fdi_gym.engine import simulate
 from fdi_gym.estimation.flags import largest
 from fdi_gym.estimation.propagation import FaultInputs
 from fdi_gym.plant import Array, Plant
-from fdi_gym.engine import simulate
+from fdi_gym.plants.huav_hover import prescribed_noise
 
 MRAD = 1e-3
 CALIBRATION_SEEDS = range(5000, 5100)
@@ -81,7 +82,8 @@ def calibrate(
     """
     process = plant.process("fault-free")
     scenarios = [process.sample(np.random.default_rng([s, 1])).replace(noise_seed=s + 1_000_000) for s in seeds]
-    obs = simulate(plant, scenarios).obs
+    noise = [prescribed_noise(np.random.default_rng(s.noise_seed), s.steps) for s in scenarios]
+    obs = simulate(plant, scenarios, noise).obs
     return np.quantile(largest(diagnoser, obs), quantile, axis=0)
 
 

@@ -31,9 +31,9 @@ from baselines.networks.identification import Model, Shape
 from baselines.networks.observed import IdentifiedFeatures
 from baselines.networks.policy import actor_tensors, streaming
 from fdi_gym.diagnosis import run
+from fdi_gym.engine import Record
 from fdi_gym.plant import Array
 from fdi_gym.sb3 import FDIVecEnv
-from fdi_gym.engine import Record
 from fdi_gym.wrappers import DelayAwareReward
 
 HEAVIEST = 10.0  # weight of a rare label's reward

@@ -15,13 +15,14 @@ import numpy as np
 import tyro
 
 from baselines.filters.mekf import changes
+from baselines.reproduction.numbered import fly
 from baselines.reproduction.tables import pieces
 from fdi_gym.diagnosis import find_diagnoser, make_diagnoser
+from fdi_gym.engine import Record
 from fdi_gym.estimation.covariance_adaptation import BETA_0, MEMORY
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant, load_plant
 from fdi_gym.plants import cmg_satellite as cmg
-from fdi_gym.engine import Record, simulate
 
 METHODS = {
     "UKF": "joint_ukf", "CAUKF": "caukf", "GAUKF": "gaukf", "SGAUKF": "sgaukf", "SGAUKF-odd": "sgaukf_odd",
@@ -209,7 +210,7 @@ def run_piece(p: Piece) -> dict[str, Any]:
     if p.method == "oracle":
         low, high = (max(p.level - 0.005, 0.0), p.level + 0.005) if p.variant == "severity" else ALPHA[p.variant]
         tuning = {"alpha_min": low, "alpha_max": high}
-    record = simulate(plant, scenarios)
+    record = fly(plant, scenarios)
     said = watch(plant, scenarios, record, p.method, **tuning)
     outcomes = []
     for i, scenario in enumerate(scenarios):

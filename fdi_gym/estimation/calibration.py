@@ -20,6 +20,7 @@ import msgspec
 import numpy as np
 
 from fdi_gym.diagnosis import Diagnoser
+from fdi_gym.engine import Record
 from fdi_gym.estimation.alarm import (
     LEAST,
     PERSISTENCE,
@@ -35,7 +36,6 @@ from fdi_gym.estimation.alarm import (
 from fdi_gym.estimation.prior import flights_of
 from fdi_gym.kernels import cache_folder
 from fdi_gym.plant import Array, Plant, plant_sources
-from fdi_gym.engine import Record
 
 RATE = 0.05  # share of the healthy flights with a false alarm
 FIRST = 100_000  # calibration flights begin at VALIDATION_SEED + FIRST

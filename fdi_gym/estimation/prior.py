@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi_gym.diagnosis import NotApplicableError
+from fdi_gym.engine import Record, simulate
 from fdi_gym.estimation.propagation import FaultInputs, fault_inputs
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.plant import Array, Plant
-from fdi_gym.engine import Record, simulate
 
 VALIDATION_SEED = 2_000_000
 FLIGHTS = 32
