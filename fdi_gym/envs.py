@@ -427,8 +427,8 @@ class FDIVectorEnv(Specified, VectorEnv):
             **{name: float(values[row, i]) for name, values in self._monitored.items()},
         }
 
-    def truth(self) -> dict[str, Array]:
-        """The truth to which the next actions will be compared, by the names of `info`: arrays over the environments.
+    def truth(self, *names: str) -> dict[str, Array]:
+        """The truth to which the next actions will be compared, by the names of `info` (all, or these): arrays (N, ...).
 
         Raises:
             RuntimeError: No episode has begun.
@@ -436,7 +436,9 @@ class FDIVectorEnv(Specified, VectorEnv):
         if self._flights is None:
             raise RuntimeError("no episode has begun: call reset()")
         found = {"label": self._buffer.label, "target": self._target, "theta": self._buffer.theta, **self._monitored}
-        return {name: self._here(a).copy() for name, a in found.items()} | {"time": self._k * self.plant.dt}
+        found = {name: a for name, a in found.items() if not names or name in names}
+        clock = {} if names and "time" not in names else {"time": self._k * self.plant.dt}
+        return {name: self._here(a).copy() for name, a in found.items()} | clock
 
     def _infos(self, mask: Array) -> dict[str, Any]:
         """The infos of the masked environments, in Gymnasium's vector form."""

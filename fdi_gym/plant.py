@@ -210,6 +210,10 @@ class Plant:
         if scenario.plant != self.id:
             raise ValueError(f"the scenario belongs to {scenario.plant}, not to {self.id}")
 
+    def __reduce__(self) -> Any:
+        recipe = vars(self).get("_recipe")
+        return (_load_again, recipe) if recipe else super().__reduce__()
+
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the addresses of compiled functions, which hold in one process only."""
         return {name: value for name, value in vars(self).items() if name != "addresses"}
@@ -443,4 +447,10 @@ def load_plant(plant_id: str, **options: Any) -> Plant:
     for option in options:
         if option not in allowed:
             raise ValueError(f"unknown option {option!r}; {plant_id} has {', '.join(allowed) or 'none'}")
-    return build(**options)
+    plant = build(**options)
+    object.__setattr__(plant, "_recipe", (plant_id, options))
+    return plant
+
+
+def _load_again(plant_id: str, options: Mapping[str, Any]) -> Plant:
+    return load_plant(plant_id, **options)

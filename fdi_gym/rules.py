@@ -130,7 +130,8 @@ class Rules:
         if scenario is not None and (process is not None or mismatch is not None):
             raise ValueError("a scenario is replayed as it is: neither a process nor a mismatch goes with it")
         self.scenario = None if scenario is None else self.checked_scenario(scenario, "scenario")
-        self.process = self.plant.process("standard" if process is None else process)
+        self.process = "standard" if process is None else process
+        self.plant.process(self.process)  # there is one of that name
         self._declare_spaces(units)
 
     def _declare_spaces(self, units: str) -> None:
@@ -191,7 +192,7 @@ class Rules:
         """The scenario of an episode: replayed as it is where one was given, else drawn from the seed."""
         if self.scenario is not None:
             return self.scenario
-        return draw(self.process, seed, None if self.mismatch is None else self._perturb)
+        return draw(self.plant.process(self.process), seed, None if self.mismatch is None else self._perturb)
 
     def _perturb(self, rng: np.random.Generator) -> Mapping[str, Any]:
         return self.plant.perturb(rng, self.mismatch)  # type: ignore[misc,arg-type]
