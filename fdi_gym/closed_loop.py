@@ -80,25 +80,25 @@ def _effects(k, seen, dt, table, count, values, held, nominal, a, b, g):
 
 
 @numba.njit
-def _sense(k, y, z, sigma, limit, injected, v, sensors, box, history, last, reading, shown):
+def _sense(k, y, z, row, sigma, limit, injected, v, sensors, s, slot, box, history, last, reading, shown):
     """What the sensors say: `reading` (what the controller gets) and `shown` (NaN where a sensor does not report)."""
     for i in range(y.size):
         true = y[i]
         if history.shape[0]:
             history[k % history.shape[0], i] = true
-        noise = v[k, i] if injected else sigma[i] * min(max(z[i], -limit), limit) if sigma[i] else 0.0
+        noise = v[k, i] if injected else sigma[i] * min(max(z[row, i], -limit), limit) if sigma[i] else 0.0
         missing = frozen = False
-        if sensors.size:
-            lag = np.int64(sensors[i, LAG])
+        if sensors.shape[0]:
+            lag = np.int64(sensors[s, slot, i, LAG])
             if lag:
                 true = history[max(k - lag, 0) % history.shape[0], i]
-            if sensors[i, GAIN]:
-                true += sensors[i, GAIN] * true
-            if sensors[i, BIAS]:
-                true += sensors[i, BIAS]
-            if sensors[i, NOISE]:
-                noise += sensors[i, NOISE] * noise
-            frozen, missing = sensors[i, FROZEN] != 0.0, sensors[i, MISSING] != 0.0
+            if sensors[s, slot, i, GAIN]:
+                true += sensors[s, slot, i, GAIN] * true
+            if sensors[s, slot, i, BIAS]:
+                true += sensors[s, slot, i, BIAS]
+            if sensors[s, slot, i, NOISE]:
+                noise += sensors[s, slot, i, NOISE] * noise
+            frozen, missing = sensors[s, slot, i, FROZEN] != 0.0, sensors[s, slot, i, MISSING] != 0.0
         says = min(max(true + noise, box[0, i]), box[1, i])
         if (frozen or missing) and k:
             says = last[i]
@@ -139,7 +139,7 @@ def fly(
     x, u, c, p_i, acts = np.empty(n), np.empty(n_u), np.empty(n_c), np.empty(p.shape[1]), np.empty(n_theta)
     y, reading, shown, fed, out = np.empty(n_y), np.empty(n_y), np.empty(n_y), np.empty(n_y), np.empty(n_k)
     a, b, g, theta_k = np.empty(n_theta), np.empty(n_theta), np.empty(n_theta), np.empty(n_theta)
-    r, d, healthy = np.empty(n_r), np.empty(n_d), np.empty((0, FAULTS))
+    r, d = np.empty(n_r), np.empty(n_d)
     k1, k2, k3, k4, z, before = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     used, words, normals = sigma > 0.0, np.empty((2, TILE), np.uint64), np.zeros((TILE, sigma.size))
     steady = not used.any()
@@ -165,7 +165,8 @@ def fly(
             disturbances = numba.carray(_pointer(disturbance_at[slot]), (last + 1, n_d), float64)
             w = numba.carray(_pointer(process_noise[slot]), (last, n), float64)
             v = numba.carray(_pointer(sensor_noise[slot]), (last + 1, n_y), float64)
-            segment = 0
+            acting, count, values_i, held_i = effects[slot], counts[slot], values[slot], held[slot]
+            readings_i, history, segment = readings[slot], histories[slot], 0
             for s in range(tile, min(tile + TILE, samples)):
                 row, t = first + s, k * dt
                 # sample k: what acts, what is measured, what is known
@@ -173,15 +174,14 @@ def fly(
                     r[i] = references[k, i]
                 for i in range(n_d):
                     d[i] = disturbances[min(k, last - 1), i]
-                _effects(k, True, dt, effects[slot], counts[slot], values[slot], held[slot], nominal, a, b, g)
+                _effects(k, True, dt, acting, count, values_i, held_i, nominal, a, b, g)
                 for j in range(n_theta):
                     theta_k[j] = a[j] + b[j]
                 output(t, x, u, theta_k, d, p_i, y)
                 for i in range(n_y):
                     fed[i] = y[i]
                 _sense(
-                    k, y, normals[s - tile], sigma, limit, injected, v,
-                    sensors[s, slot] if sensors.shape[0] else healthy, sensor_box, histories[slot], readings[slot],
+                    k, y, normals, s - tile, sigma, limit, injected, v, sensors, s, slot, sensor_box, history, readings_i,
                     reading, shown,
                 )  # fmt: skip
                 if not true_feedback:
@@ -211,10 +211,10 @@ def fly(
                     for i in range(n_u):
                         if inputs[s, slot, i]:
                             u[i] = min(max(u[i] + inputs[s, slot, i], command_box[0, i]), command_box[1, i])
-                for e in range(counts[slot]):
-                    if effects[slot, e, KIND] == HOLD and k == effects[slot, e, ONSET] - effects[slot, e, SECOND]:
-                        held[slot, e] = u[np.int64(effects[slot, e, FIRST])]
-                drifts = _effects(k, False, dt, effects[slot], counts[slot], values[slot], held[slot], nominal, a, b, g)
+                for e in range(count):
+                    if acting[e, KIND] == HOLD and k == acting[e, ONSET] - acting[e, SECOND]:
+                        held_i[e] = u[np.int64(acting[e, FIRST])]
+                drifts = _effects(k, False, dt, acting, count, values_i, held_i, nominal, a, b, g)
                 for i in range(n):
                     before[i] = x[i]
                 interval(dynamics, project, t, dt, substeps, x, u, drifts, a, b, g, d, p_i, acts, k1, k2, k3, k4, z)

@@ -210,9 +210,9 @@ class Flights:
     def _point(self, i: int) -> None:
         """Note where flight i's tables lie; they live as long as this does."""
         *tables, samples = self.tables[i]
-        self.addresses[:, i] = [0 if table is None else table.ctypes.data for table in tables]
+        self.addresses[:, i] = [0 if table is None else table.__array_interface__["data"][0] for table in tables]
         for e, table in samples.items():
-            self.values[i, e] = table.ctypes.data
+            self.values[i, e] = table.__array_interface__["data"][0]
 
     def arrays(self) -> tuple[Array, ...]:
         """Tables and state in the order of the compiled call."""

@@ -91,6 +91,7 @@ class FDIEnv(Specified, gym.Env):
         self.observation_space, self.action_space = self._rules.observation_space, self._rules.action_space
         self.render_mode = render_mode
         self.scenario: FaultScenario | None = None
+        self._flights: Flights | None = None
         self._rewards: list[list[float]] = np.asarray(self.plant.isolation_reward, float).tolist()
         self._k, self._over = 0, True
         self._declared: list[tuple[int, Any]] = []
@@ -111,7 +112,10 @@ class FDIEnv(Specified, gym.Env):
         super().reset(seed=seed)
         episode_seed = int(self.np_random.integers(2**63)) if seed is None else seed
         self.scenario = self._rules.draw(episode_seed) if replay is None else replay
-        self._flights = Flights(self.plant, [self.scenario])
+        if self._flights is None:
+            self._flights = Flights(self.plant, [self.scenario])
+        else:
+            self._flights.begin([0], [self.scenario])
         self._k, self._over, self._declared, self._record = 0, False, [], None
         self._base, self._flown, self._ahead = 0, 0, 0
         self._fly()
@@ -121,6 +125,7 @@ class FDIEnv(Specified, gym.Env):
 
     def _fly(self) -> None:
         """Fly on, and keep of the samples before what a block may still reach back to."""
+        assert self._flights is not None
         self._ahead = ahead(self._ahead, self._rules.period)
         chunk = advance(self._flights, self._ahead)
         obs, theta, label = chunk.obs[:, 0], chunk.theta[:, 0], chunk.label[:, 0].tolist()
@@ -320,8 +325,6 @@ class FDIVectorEnv(Specified, VectorEnv):
             self._buffer = self._flights.blank(period + ahead(CHUNK, period))
             self._target = self._buffer.theta if self.plant.target is None else \
                 np.zeros((*self._buffer.label.shape, len(self.plant.estimated)))  # fmt: skip
-            monitored = self.plant.monitor(self._buffer.state[:1])
-            self._monitored = {name: np.zeros(self._buffer.label.shape) for name in monitored}
             self._row = np.zeros(self.num_envs, np.int64)
         else:
             self._flights.begin(slots, scenarios)
@@ -338,17 +341,14 @@ class FDIVectorEnv(Specified, VectorEnv):
         advance(flights, self._filled - first, self._buffer, first, slots)
         rows = slice(first, self._filled)
         where: Any = rows if slots.size == self.num_envs else (rows, slots)
-        obs, state, theta, _ = self._buffer
+        obs, _, theta, _ = self._buffer
         if self.plant.target is not None:
             self._target[where] = self.plant.estimate_target(theta[where], self.plant.split(obs[where])[1])
-        if self._monitored:
-            for name, values in self.plant.monitor(state[where]).items():
-                self._monitored[name][where] = values
 
     def _fly_all(self) -> None:
         """The next chunk of all flights; the last rows before it stay, since a block may reach back to them."""
         m = self._rules.period
-        for array in {id(a): a for a in (*self._buffer, self._target, *self._monitored.values())}.values():
+        for array in {id(a): a for a in (*self._buffer, self._target)}.values():
             array[:m] = array[self._now - m + 1 : self._now + 1].copy()
         self._now, self._ahead = m - 1, ahead(self._ahead, m)
         self._filled = m + self._ahead
@@ -424,7 +424,7 @@ class FDIVectorEnv(Specified, VectorEnv):
             "target": self._target[row, i].copy(),
             "theta": self._buffer.theta[row, i].copy(),
             "time": float(self._k[i] * self.plant.dt),
-            **{name: float(values[row, i]) for name, values in self._monitored.items()},
+            **{name: float(value) for name, value in self.plant.monitor(self._buffer.state[row, i]).items()},
         }
 
     def truth(self, *names: str) -> dict[str, Array]:
@@ -435,10 +435,14 @@ class FDIVectorEnv(Specified, VectorEnv):
         """
         if self._flights is None:
             raise RuntimeError("no episode has begun: call reset()")
-        found = {"label": self._buffer.label, "target": self._target, "theta": self._buffer.theta, **self._monitored}
-        found = {name: a for name, a in found.items() if not names or name in names}
-        clock = {} if names and "time" not in names else {"time": self._k * self.plant.dt}
-        return {name: self._here(a).copy() for name, a in found.items()} | clock
+        recorded = {"label": self._buffer.label, "target": self._target, "theta": self._buffer.theta}
+        found = {name: self._here(a).copy() for name, a in recorded.items() if not names or name in names}
+        if not names or "time" in names:
+            found["time"] = self._k * self.plant.dt
+        if not names or not set(names) <= {*recorded, "time"}:
+            monitored = self.plant.monitor(self._here(self._buffer.state))
+            found |= {name: value for name, value in monitored.items() if not names or name in names}
+        return found
 
     def _infos(self, mask: Array) -> dict[str, Any]:
         """The infos of the masked environments, in Gymnasium's vector form."""
