@@ -22,8 +22,8 @@ import tyro
 from baselines.filters.augmented_ekf_bank import augmented_ekf_bank
 from baselines.filters.missile_ekf import Q_THETA, SIGMA_RHO, SIGMA_THETA, THETA_MAX, THETA_MIN
 from fdi_gym.diagnosis import make_diagnoser, run
+from fdi_gym.engine import simulate
 from fdi_gym.plants import missile_pitch as m
-from fdi_gym.simulation import simulate
 
 DEG = np.pi / 180
 R = np.diag(np.square(m.SIGMA[:2]))

@@ -1,4 +1,4 @@
-"""The two Gymnasium environments: one flight, and many side by side. Thin shells over recorded flights."""
+"""The two Gymnasium environments: one flight, and many side by side. Thin shells over flights that are flown ahead."""
 
 from __future__ import annotations
 
@@ -6,112 +6,26 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.spaces import Box, Discrete, Space
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from fdi_gym.faults import FaultScenario, draw
-from fdi_gym.plant import Array, Plant, Signal, load_plant
-from fdi_gym.simulation import Record, simulate
+from fdi_gym.engine import Flights, Record, advance, simulate
+from fdi_gym.faults import FaultScenario
+from fdi_gym.plant import Array, Plant
+from fdi_gym.rules import Rules, Specified, checked_mask, checked_seed, checked_seeds, whole
 
-TASKS = ("isolation", "identification")
-UNITS = ("physical", "scaled")
-
-
-def _column(signals: tuple[Signal, ...], field: str) -> Array:
-    return np.array([getattr(s, field) for s in signals], float)
+# Samples that are flown ahead of the agent: few after a reset, since an episode may be short, and twice as many each time.
+# `python benchmarks/engine.py --chunks` measures what the two cost.
+FIRST, CHUNK = 16, 256
 
 
-class _Game:
-    """The rules that both environments share: what is flown, what is shown and what a diagnosis is worth."""
-
-    def __init__(
-        self, plant: str | Plant, task: str, scenario: str | FaultScenario, mismatch: float | None,
-        decision_period: int, units: str, options: dict[str, Any],
-    ):  # fmt: skip
-        if units not in UNITS:
-            raise ValueError(f"unknown units {units!r}; there are {', '.join(UNITS)}")
-        if task not in TASKS:
-            raise ValueError(f"unknown task {task!r}; there are {', '.join(TASKS)}")
-        if not isinstance(decision_period, int) or decision_period < 1:
-            raise ValueError(f"decision_period is a whole number of samples, at least 1, not {decision_period!r}")
-        self.plant = load_plant(plant, **options) if isinstance(plant, str) else plant
-        self.task, self.period = task, decision_period
-        if isinstance(scenario, str) and scenario.lstrip().startswith("{"):
-            scenario = FaultScenario.from_json(scenario)
-        if isinstance(scenario, str):
-            self.plant.process(scenario)
-        self.scenario = scenario
-        self.perturb = None
-        if mismatch is not None:
-            perturb = self.plant.perturb
-            if perturb is None:
-                raise ValueError(f"{self.plant.id} declares no mismatch")
-            self.perturb = lambda rng: perturb(rng, mismatch)
-        seen, asked = self.plant.observed, self.plant.estimated
-        low, high = _column(seen, "low"), _column(seen, "high")
-        self.low, self.high = _column(asked, "low"), _column(asked, "high")
-        self.scaled = units == "scaled"
-        self._nominal, self._scale = _column(seen, "nominal"), _column(seen, "scale")
-        dtype = np.float32 if self.scaled else np.float64
-        if self.scaled:  # a rounding step wider, so that the cast to float32 cannot leave the space
-            low = np.nextafter(np.float32((low - self._nominal) / self._scale), np.float32(-np.inf))
-            high = np.nextafter(np.float32((high - self._nominal) / self._scale), np.float32(np.inf))
-        if decision_period > 1:
-            low, high = np.tile(low, (decision_period, 1)), np.tile(high, (decision_period, 1))
-        self.observation_space = Box(low, high, dtype=dtype)
-        if task == "isolation":
-            self.action_space: Space = Discrete(len(self.plant.labels))
-        elif self.scaled:
-            self.action_space = Box(-1.0, 1.0, (len(asked),), dtype=np.float32)
-        else:
-            self.action_space = Box(self.low, self.high, dtype=np.float64)
-
-    def show(self, obs: Array) -> Array:
-        """An observation in the units that were asked for; always a new array."""
-        return ((obs - self._nominal) / self._scale).astype(np.float32) if self.scaled else obs.copy()
-
-    def draw(self, seed: int) -> FaultScenario:
-        """The scenario of an episode: replayed as it is where one was given, else drawn from the seed."""
-        if isinstance(self.scenario, FaultScenario):
-            return self.scenario
-        return draw(self.plant.process(self.scenario), seed, self.perturb)
-
-    def check_label(self, action: Any) -> int:
-        """A single label, checked as `check` does, quickly."""
-        if isinstance(action, (int, np.integer)) and 0 <= action < len(self.plant.labels):
-            return int(action)
-        return int(self.check(action, ()))
-
-    def check(self, action: Any, shape: tuple[int, ...]) -> Array:
-        """The action as an array.
-
-        Raises:
-            ValueError: Wrong shape, NaN, or not a label; the message says what is allowed.
-        """
-        value = np.asarray(action)
-        if self.task == "isolation":
-            n = len(self.plant.labels)
-            if value.shape != shape or value.dtype.kind not in "iu" or (value < 0).any() or (value >= n).any():
-                raise ValueError(f"the action is a label in 0..{n - 1}, shape {shape} and integer, not {action!r}")
-            return value
-        space = self.action_space
-        assert isinstance(space, Box)
-        if value.shape != (*shape, *space.shape) or value.dtype.kind not in "iuf" or not np.isfinite(value).all():
-            raise ValueError(f"the action is finite and has the shape {(*shape, *space.shape)}, not {action!r}")
-        if self.scaled:
-            value = self.low + (self.high - self.low) * (value.astype(np.float64) + 1) / 2
-        return np.clip(value, self.low, self.high)
-
-    def reward(self, action: Array, label: Any, target: Array) -> Any:
-        """What a checked action is worth where the truth is label (...) and target (..., n)."""
-        if self.task == "isolation":
-            return self.plant.isolation_reward[label, action]  # type: ignore[index]
-        return self.plant.identification_reward(action - target)  # type: ignore[misc]
+def ahead(before: int, period: int) -> int:
+    """Samples to fly next, after so many: a multiple of the decision period."""
+    return period * -(-min(max(2 * before, FIRST), CHUNK) // period)
 
 
-class FDIEnv(gym.Env):
+class FDIEnv(Specified, gym.Env):
     """Fault diagnosis as an environment: the observation is what the sensors say, the action is the diagnosis.
 
     Observation space: `Box` of float64 in physical units, `[y_k, u_{k-1}, known_k]`: the sensors at sample k, the
@@ -135,11 +49,13 @@ class FDIEnv(gym.Env):
     Info: the truth to which the next action will be compared: `label` (int), `target` and `theta` (arrays), `time` [s];
     and what the plant's `monitor` says of the state (floats). For training only; the evaluation never passes it on.
 
+    Pickled, copied or sent to another process, it goes on with the same bytes.
+
     Args:
         plant: Plant id (set by the registration).
         task: "isolation" or "identification".
-        scenario: Name of one of the plant's fault processes, or a `FaultScenario` (also as JSON text), which is
-            replayed exactly, noise included.
+        process: Name of one of the plant's fault processes. Default: "standard".
+        scenario: A `FaultScenario`, or its JSON text, that every episode replays exactly, noise included.
         mismatch: Level of the difference between the truth's physical parameters and the diagnosers' model, in the
             plant's own measure. Default: what the process prescribes.
         decision_period: Samples per agent step.
@@ -149,7 +65,9 @@ class FDIEnv(gym.Env):
         options: The plant's own options.
 
     Raises:
-        ValueError: Unknown task, scenario, option or option value; the message lists what exists.
+        ValueError: Unknown task, process, option or option value, a scenario of another plant; the message says what is
+            allowed.
+        TypeError: An argument of another kind.
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}
@@ -158,7 +76,8 @@ class FDIEnv(gym.Env):
         self,
         plant: str | Plant,
         task: str = "isolation",
-        scenario: str | FaultScenario = "standard",
+        process: str | None = None,
+        scenario: FaultScenario | str | None = None,
         mismatch: float | None = None,
         decision_period: int = 1,
         units: str = "physical",
@@ -167,49 +86,85 @@ class FDIEnv(gym.Env):
     ):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"unknown render_mode {render_mode!r}; there are {self.metadata['render_modes']}")
-        self._game = _Game(plant, task, scenario, mismatch, decision_period, units, options)
-        self.plant = self._game.plant
-        self.observation_space, self.action_space = self._game.observation_space, self._game.action_space
+        self._rules = Rules(plant, task, process, scenario, mismatch, decision_period, units, options)
+        self.plant = self._rules.plant
+        self.observation_space, self.action_space = self._rules.observation_space, self._rules.action_space
         self.render_mode = render_mode
         self.scenario: FaultScenario | None = None
-        self._k, self._length, self._over = 0, 0, True
+        self._flights: Flights | None = None
         self._rewards: list[list[float]] = np.asarray(self.plant.isolation_reward, float).tolist()
+        self._k, self._over = 0, True
         self._declared: list[tuple[int, Any]] = []
+        self._record: Record | None = None
         self._canvas: Any = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_canvas": None, "_record": None}  # pictures are drawn anew
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
-        """Begin an episode. `options={"scenario": FaultScenario}` replays one, noise included."""
+        """Begin an episode. `options={"scenario": FaultScenario}` replays one, noise included.
+
+        Raises:
+            ValueError: A negative seed, an unknown option, a scenario of another plant.
+            TypeError: A seed that is no whole number, a scenario that is none.
+        """
+        seed, replay = checked_seed(seed), self._rules.checked_options(options, ("scenario",)).get("scenario")
         super().reset(seed=seed)
-        replay = (options or {}).get("scenario")
-        if replay is not None and not isinstance(replay, FaultScenario):
-            raise ValueError(f"options['scenario'] is a FaultScenario, not {type(replay).__name__}")
         episode_seed = int(self.np_random.integers(2**63)) if seed is None else seed
-        self.scenario = replay or self._game.draw(episode_seed)
-        record = simulate(self.plant, [self.scenario])
-        self._obs, self._target, self._theta = record.obs[0], record.target[0], record.theta[0]
-        self._label: list[int] = record.label[0].tolist()
-        self._monitored = {name: a.tolist() for name, a in self.plant.monitor(record.state[0]).items()}
-        self._length, self._terminated = int(record.length[0]), bool(record.terminated[0])
-        self._record = record
-        self._k, self._over, self._declared = 0, False, []
+        self.scenario = self._rules.draw(episode_seed) if replay is None else replay
+        if self._flights is None:
+            self._flights = Flights(self.plant, [self.scenario])
+        else:
+            self._flights.begin([0], [self.scenario])
+        self._k, self._over, self._declared, self._record = 0, False, [], None
+        self._base, self._flown, self._ahead = 0, 0, 0
+        self._fly()
         if self.render_mode == "human":
             self.render()
         return self._block(0), self._info(0)
 
+    def _fly(self) -> None:
+        """Fly on, and keep of the samples before what a block may still reach back to."""
+        assert self._flights is not None
+        self._ahead = ahead(self._ahead, self._rules.period)
+        chunk = advance(self._flights, self._ahead)
+        obs, theta, label = chunk.obs[:, 0], chunk.theta[:, 0], chunk.label[:, 0].tolist()
+        target = self.plant.estimate_target(theta, self.plant.split(obs)[1])
+        monitored = {name: a.tolist() for name, a in self.plant.monitor(chunk.state[:, 0]).items()}
+        keep = min(self._flown - self._base, self._flown - self._k + self._rules.period - 2)
+        if keep > 0:
+            obs, theta, target = (
+                np.concatenate([old[-keep:], new])
+                for old, new in ((self._obs, obs), (self._theta, theta), (self._target, target))
+            )
+            label = self._label[-keep:] + label
+            monitored = {name: self._monitored[name][-keep:] + values for name, values in monitored.items()}
+        self._obs, self._theta, self._target, self._label, self._monitored = obs, theta, target, label, monitored
+        self._base, self._flown = self._flown - max(keep, 0), self._flown + self._ahead
+        self._length, self._terminated = int(self._flights.length[0]), bool(self._flights.terminated[0])
+
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Judge the diagnosis of the interval that ended at the current sample, and fly on to the next observation."""
+        """Judge the diagnosis of the interval that ended at the current sample, and fly on to the next observation.
+
+        Raises:
+            ValueError: The action is not of the action space's kind; nothing has happened then.
+            RuntimeError: The episode is over, or has not begun.
+        """
         if self._over:
             raise RuntimeError("the episode is over, or has not begun: call reset()")
-        k = self._k
-        if self._game.task == "isolation":
-            checked: Any = self._game.check_label(action)
-            reward = self._rewards[self._label[k]][checked] if k else 0.0
+        k, rules = self._k, self._rules
+        now = k - self._base
+        if rules.task == "isolation":
+            checked: Any = rules.check_label(action)
+            reward = self._rewards[self._label[now]][checked] if k else 0.0
         else:
-            checked = self._game.check(action, ())
-            reward = float(self._game.reward(checked, self._label[k], self._target[k])) if k else 0.0
+            checked = rules.check(action, ())
+            reward = float(rules.reward(checked, self._label[now], self._target[now])) if k else 0.0
         if self.render_mode is not None:
             self._declared.append((k, checked))
-        self._k = k = min(k + self._game.period, self._length)
+        while self._flown <= k + rules.period and self._flown <= self._length:
+            self._fly()
+        self._k = k = min(k + rules.period, self._length)
         self._over = k == self._length
         if self.render_mode == "human":
             self.render()
@@ -217,28 +172,31 @@ class FDIEnv(gym.Env):
         return self._block(k), reward, terminated, self._over and not terminated, self._info(k)
 
     def _block(self, k: int) -> Array:
-        m = self._game.period
+        m, row = self._rules.period, k - self._base
         if m == 1:
-            return self._game.show(self._obs[k])
-        return self._game.show(self._obs[np.maximum(np.arange(k - m + 1, k + 1), 0)])
+            return self._rules.show(self._obs[row])
+        return self._rules.show(self._obs[row + np.maximum(np.arange(1 - m, 1), -k)])
 
     def _info(self, k: int) -> dict[str, Any]:
+        row = k - self._base
         return {
-            "label": self._label[k],
-            "target": self._target[k].copy(),
-            "theta": self._theta[k].copy(),
+            "label": self._label[row],
+            "target": self._target[row].copy(),
+            "theta": self._theta[row].copy(),
             "time": k * self.plant.dt,
-            **{name: values[k] for name, values in self._monitored.items()},
+            **{name: values[row] for name, values in self._monitored.items()},
         }
 
     def render(self) -> Array | None:
         """The episode so far: an (H, W, 3) uint8 picture for "rgb_array", a window for "human"."""
-        if self.render_mode is None:
+        if self.render_mode is None or self.scenario is None:
             return None
         from fdi_gym.plots import Canvas
 
         if self._canvas is None:
-            self._canvas = Canvas(self.plant, self._game.task, window=self.render_mode == "human")
+            self._canvas = Canvas(self.plant, self._rules.task, window=self.render_mode == "human")
+        if self._record is None:
+            self._record = simulate(self.plant, [self.scenario])
         return self._canvas.draw(self._record, self._k, self._declared)
 
     def close(self) -> None:
@@ -248,16 +206,19 @@ class FDIEnv(gym.Env):
             self._canvas = None
 
 
-class FDIVectorEnv(VectorEnv):
+class FDIVectorEnv(Specified, VectorEnv):
     """N environments side by side; equal to N `FDIEnv`, sample by sample, with episodes that end at different times.
 
     `gym.make_vec("B747Lateral-Faults-v0", num_envs=N, ...)`. Spaces, rewards and info are those of `FDIEnv`, batched.
-    The episodes being flown are held in memory: N x samples x (observation and truth) x 8 bytes.
+    All flights are flown ahead in lock-step, some hundred samples at a time, into arrays in (sample, environment, signal)
+    order that all steps read: memory is N x `CHUNK` samples, however long the flights are.
 
     Args:
         num_envs: N.
         autoreset_mode: A Gymnasium `AutoresetMode` or its name: "NextStep", "SameStep" or "Disabled".
-        plant, task, scenario, mismatch, decision_period, units, options: As in `FDIEnv`.
+        truth: False leaves `info` empty but for what ends an episode (`final_obs`, `final_info`); `truth()` gives the same
+            arrays when they are wanted.
+        plant, task, process, scenario, mismatch, decision_period, units, options: As in `FDIEnv`.
         render_mode: "rgb_array": `render` returns one picture per environment.
     """
 
@@ -268,166 +229,243 @@ class FDIVectorEnv(VectorEnv):
         plant: str | Plant,
         num_envs: int = 1,
         task: str = "isolation",
-        scenario: str | FaultScenario = "standard",
+        process: str | None = None,
+        scenario: FaultScenario | str | None = None,
         mismatch: float | None = None,
         decision_period: int = 1,
         units: str = "physical",
         render_mode: str | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        truth: bool = True,
         **options: Any,
     ):
-        if not isinstance(num_envs, int) or num_envs < 1:
-            raise ValueError(f"num_envs is a whole number, at least 1, not {num_envs!r}")
+        num_envs = whole("num_envs", num_envs, 1)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"unknown render_mode {render_mode!r}; there are {self.metadata['render_modes']}")
+        if not isinstance(truth, (bool, np.bool_)):
+            raise TypeError(f"truth is True or False, not {truth!r}")
         try:
             self._mode = AutoresetMode(autoreset_mode)
         except ValueError:
             allowed = [mode.value for mode in AutoresetMode]
             raise ValueError(f"unknown autoreset_mode {autoreset_mode!r}; there are {allowed}") from None
-        self._game = _Game(plant, task, scenario, mismatch, decision_period, units, options)
-        self.plant, self.num_envs, self.render_mode = self._game.plant, num_envs, render_mode
+        self._rules = Rules(plant, task, process, scenario, mismatch, decision_period, units, options)
+        self.plant, self.num_envs, self.render_mode = self._rules.plant, num_envs, render_mode
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
-        self.single_observation_space = self._game.observation_space
-        self.single_action_space = self._game.action_space
+        self.single_observation_space = self._rules.observation_space
+        self.single_action_space = self._rules.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.scenarios: list[FaultScenario | None] = [None] * num_envs
-        self._rngs: list[np.random.Generator | None] = [None] * num_envs
-        self._record: Record | None = None
+        self._seeds: list[int | None] = [None] * num_envs
+        self._rngs: list[np.random.Generator | None] = [None] * num_envs  # made from the seeds when they are needed
+        self._informs = bool(truth)
+        self._flights: Flights | None = None
         self._k = np.zeros(num_envs, dtype=np.int64)
         self._over = np.ones(num_envs, dtype=bool)
-        self._slots = np.arange(num_envs)
+        self._all = np.arange(num_envs)
         self._declared: list[list[tuple[int, Array]]] = [[] for _ in range(num_envs)]
+        self._records: dict[int, Record] = {}
         self._canvas: Any = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_canvas": None, "_records": {}}  # pictures are drawn anew
+
+    def _rng(self, i: int) -> np.random.Generator:
+        found = self._rngs[i]
+        if found is None:
+            found, self._seeds[i] = seeding.np_random(self._seeds[i])
+            self._rngs[i] = found
+        return found
+
+    @property
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+        """The generators of the environments, from which the seeds of their next episodes come."""
+        return tuple(self._rng(i) for i in range(self.num_envs))
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
+        """What each environment's generator was seeded with."""
+        return tuple(self._rng(i) is not None and self._seeds[i] for i in range(self.num_envs))  # type: ignore[misc]
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Begin new episodes, in all environments or in those of `options["reset_mask"]` (a bool array)."""
-        if isinstance(seed, (int, np.integer)):
-            seed = [int(seed) + i for i in range(self.num_envs)]
-        seeds: list[int | None] = [None] * self.num_envs if seed is None else list(seed)
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"one seed per environment is needed: {self.num_envs}, not {len(seeds)}")
-        mask = (options or {}).get("reset_mask")
-        if mask is None:
-            mask = np.ones(self.num_envs, dtype=bool)
-        elif not isinstance(mask, np.ndarray) or mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
-            raise ValueError(f"reset_mask is a bool array of shape ({self.num_envs},) with at least one True, not {mask!r}")
-        elif self._record is None and not mask.all():
-            raise ValueError("the first reset begins an episode in every environment: no reset_mask yet")
-        for i in np.flatnonzero(mask):
-            if seeds[i] is not None or self._rngs[i] is None:
-                self._rngs[i], _ = seeding.np_random(seeds[i])
-        self._begin(np.flatnonzero(mask), seeds)
-        return self._blocks(), self._infos(mask)
+        """Begin new episodes, in all environments or in those of `options["reset_mask"]` (a bool array).
 
-    def _begin(self, slots: Array, seeds: list[int | None]) -> None:
-        """Fly new episodes in these slots."""
-        for i in slots:
-            rng, seed = self._rngs[i], seeds[i]
-            assert rng is not None
-            self.scenarios[i] = self._game.draw(int(rng.integers(2**63)) if seed is None else seed)
+        `options={"scenario": FaultScenario}` replays one in each of them, noise included.
+
+        Raises:
+            ValueError, TypeError: As in `FDIEnv.reset`; also where not one seed per environment is given, or a mask that is
+                none. Nothing has happened then.
+        """
+        seeds = checked_seeds(seed, self.num_envs)
+        found = self._rules.checked_options(options, ("scenario", "reset_mask"))
+        mask = checked_mask(found.get("reset_mask", np.ones(self.num_envs, bool)), self.num_envs)
+        if self._flights is None and not mask.all():
+            raise ValueError("the first reset begins an episode in every environment: no reset_mask yet")
+        self._begin(np.flatnonzero(mask), seeds, found.get("scenario"))
+        return self._observation(), self._infos(mask)
+
+    def _begin(self, slots: Array, seeds: list[int | None], replay: FaultScenario | None = None) -> None:
+        """Begin an episode in each of these environments, at the row where all are."""
+        for i in slots.tolist():
+            seed = seeds[i]
+            if seed is None:
+                episode_seed = int(self._rng(i).integers(2**63))
+            else:
+                episode_seed, self._seeds[i], self._rngs[i] = seed, seed, None
+            self.scenarios[i] = self._rules.draw(episode_seed) if replay is None else replay
             self._declared[i] = []
-        record = simulate(self.plant, [s for i in slots if (s := self.scenarios[i]) is not None])
-        if self._record is None or record.obs.shape[1] > self._record.obs.shape[1]:
-            steps = record.obs.shape[1]
-            if self._record is None:
-                self._record = Record(*(np.zeros((self.num_envs, *a.shape[1:]), a.dtype) for a in record))
-            else:
-                self._record = Record(*(
-                    a if a.ndim == 1 else np.concatenate([a, np.repeat(a[:, -1:], steps - a.shape[1], axis=1)], axis=1)
-                    for a in self._record
-                ))  # fmt: skip
-        for old, new in zip(self._record, record, strict=True):
-            if new.ndim == 1:
-                old[slots] = new
-            else:
-                old[slots, : new.shape[1]] = new
-        self._k[slots], self._over[slots] = 0, False
+            self._records.pop(i, None)
+        scenarios = [s for i in slots if (s := self.scenarios[i]) is not None]
+        if self._flights is None:
+            self._flights = Flights(self.plant, scenarios)
+            period = self._rules.period
+            self._buffer = self._flights.blank(period + ahead(CHUNK, period))
+            self._target = self._buffer.theta if self.plant.target is None else \
+                np.zeros((*self._buffer.label.shape, len(self.plant.estimated)))  # fmt: skip
+            self._row = np.zeros(self.num_envs, np.int64)
+        else:
+            self._flights.begin(slots, scenarios)
+        if slots.size == self.num_envs:
+            self._now, self._ahead = self._rules.period - 1, ahead(0, self._rules.period)
+            self._filled = self._now + 1 + self._ahead
+        self._k[slots], self._over[slots], self._row[slots] = 0, False, self._now
+        self._fly(self._now, slots)
+
+    def _fly(self, first: int, slots: Array) -> None:
+        """Fly these flights from this row on to where all end."""
+        flights = self._flights
+        assert flights is not None
+        advance(flights, self._filled - first, self._buffer, first, slots)
+        rows = slice(first, self._filled)
+        where: Any = rows if slots.size == self.num_envs else (rows, slots)
+        obs, _, theta, _ = self._buffer
+        if self.plant.target is not None:
+            self._target[where] = self.plant.estimate_target(theta[where], self.plant.split(obs[where])[1])
+
+    def _fly_all(self) -> None:
+        """The next chunk of all flights; the last rows before it stay, since a block may reach back to them."""
+        m = self._rules.period
+        for array in {id(a): a for a in (*self._buffer, self._target)}.values():
+            array[:m] = array[self._now - m + 1 : self._now + 1].copy()
+        self._now, self._ahead = m - 1, ahead(self._ahead, m)
+        self._filled = m + self._ahead
+        self._fly(m, self._all)
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Step every environment; those that ended are treated as the autoreset mode says."""
-        record = self._record
-        if record is None:
+        """Step every environment; those that ended are treated as the autoreset mode says.
+
+        Raises:
+            ValueError: An action is not of the action space's kind; nothing has happened then.
+            RuntimeError: No episode has begun; or, without autoreset, one is over.
+        """
+        flights = self._flights
+        if flights is None:
             raise RuntimeError("no episode has begun: call reset()")
-        checked = self._game.check(actions, (self.num_envs,))
-        begin = np.flatnonzero(self._over)
+        checked = self._rules.check(actions, (self.num_envs,))
+        over = self._over
+        begin = np.flatnonzero(over)
         if begin.size and self._mode is AutoresetMode.DISABLED:
             raise RuntimeError(f"episodes {begin.tolist()} are over: reset them with options={{'reset_mask': ...}}")
         k = self._k
-        reward = np.asarray(self._game.reward(checked, record.label[self._slots, k], record.target[self._slots, k]), float)
-        reward = np.where((k == 0) | self._over, 0.0, reward)
+        reward = np.asarray(self._rules.reward(checked, self._here(self._buffer.label), self._here(self._target)), float)
+        reward = np.where((k == 0) | over, 0.0, reward)
         if self.render_mode is not None:
-            for i in np.flatnonzero(~self._over):
+            for i in np.flatnonzero(~over):
                 self._declared[i].append((int(k[i]), checked[i]))
-        self._k = np.where(self._over, k, np.minimum(k + self._game.period, record.length))
-        ended = (self._k == record.length) & ~self._over
-        terminated = ended & record.terminated
+        if self._now + 1 == self._filled:
+            self._fly_all()
+        period = self._rules.period
+        self._k = np.where(over, k, np.minimum(k + period, flights.length))
+        self._row = self._now + self._k - k
+        self._now += period
+        ended = (self._k == flights.length) & ~over
+        terminated = ended & flights.terminated
         truncated = ended & ~terminated
+        self._over = ended
         infos: dict[str, Any] = {}
         if self._mode is AutoresetMode.SAME_STEP:
             begin = np.flatnonzero(ended)
             for i in begin.tolist():
                 infos = self._add_info(infos, {"final_obs": self._block(i), "final_info": self._info(i)}, i)
-        self._over = ended
         if begin.size:
             self._begin(begin, [None] * self.num_envs)
-        return (
-            self._blocks(),
-            reward,
-            terminated,
-            truncated,
-            {**infos, **self._infos(np.ones(self.num_envs, dtype=bool))},
-        )
+        if self._informs:
+            infos |= self._infos(np.ones(self.num_envs, dtype=bool))
+        return self._observation(), reward, terminated, truncated, infos
 
-    def _blocks(self) -> Array:
-        assert self._record is not None
-        m = self._game.period
+    def _here(self, array: Array) -> Array:
+        """A recorded quantity (rows, N, ...) at each environment's current sample."""
+        if self._rules.period == 1 or (self._row == self._now).all():
+            return array[self._now]
+        return array[self._row, self._all]
+
+    def _observation(self) -> Array:
+        m, now = self._rules.period, self._now
         if m == 1:
-            return self._game.show(self._record.obs[self._slots, self._k])
-        rows = np.maximum(self._k[:, None] + np.arange(1 - m, 1), 0)
-        return self._game.show(self._record.obs[self._slots[:, None], rows])
+            return self._rules.show(self._buffer.obs[now])
+        shown = self._rules.show(self._buffer.obs[now - m + 1 : now + 1].swapaxes(0, 1))
+        for i in np.flatnonzero((self._k == 0) | (self._row != now)).tolist():
+            shown[i] = self._block(i)
+        return shown
 
     def _block(self, i: int) -> Array:
-        assert self._record is not None
-        m = self._game.period
-        rows = np.maximum(np.arange(self._k[i] - m + 1, self._k[i] + 1), 0)
-        return self._game.show(self._record.obs[i, rows[0]] if m == 1 else self._record.obs[i, rows])
+        m, row = self._rules.period, self._row[i]
+        if m == 1:
+            return self._rules.show(self._buffer.obs[row, i])
+        return self._rules.show(self._buffer.obs[row + np.maximum(np.arange(1 - m, 1), -self._k[i]), i])
 
     def _info(self, i: int) -> dict[str, Any]:
-        assert self._record is not None
-        k = self._k[i]
+        row = self._row[i]
         return {
-            "label": int(self._record.label[i, k]),
-            "target": self._record.target[i, k].copy(),
-            "theta": self._record.theta[i, k].copy(),
-            "time": float(k * self.plant.dt),
-            **{name: float(value) for name, value in self.plant.monitor(self._record.state[i, k]).items()},
+            "label": int(self._buffer.label[row, i]),
+            "target": self._target[row, i].copy(),
+            "theta": self._buffer.theta[row, i].copy(),
+            "time": float(self._k[i] * self.plant.dt),
+            **{name: float(value) for name, value in self.plant.monitor(self._buffer.state[row, i]).items()},
         }
+
+    def truth(self, *names: str) -> dict[str, Array]:
+        """The truth to which the next actions will be compared, by the names of `info` (all, or these): arrays (N, ...).
+
+        Raises:
+            RuntimeError: No episode has begun.
+        """
+        if self._flights is None:
+            raise RuntimeError("no episode has begun: call reset()")
+        recorded = {"label": self._buffer.label, "target": self._target, "theta": self._buffer.theta}
+        found = {name: self._here(a).copy() for name, a in recorded.items() if not names or name in names}
+        if not names or "time" in names:
+            found["time"] = self._k * self.plant.dt
+        if not names or not set(names) <= {*recorded, "time"}:
+            monitored = self.plant.monitor(self._here(self._buffer.state))
+            found |= {name: value for name, value in monitored.items() if not names or name in names}
+        return found
 
     def _infos(self, mask: Array) -> dict[str, Any]:
         """The infos of the masked environments, in Gymnasium's vector form."""
-        assert self._record is not None
-        found = {name: getattr(self._record, name)[self._slots, self._k] for name in ("label", "target", "theta")}
-        found |= {"time": self._k * self.plant.dt, **self.plant.monitor(self._record.state[self._slots, self._k])}
-        for value in found.values():
-            value[~mask] = 0
+        if not self._informs:
+            return {}
+        found = self.truth()
+        if not mask.all():
+            for value in found.values():
+                value[~mask] = 0
         return found | {f"_{name}": mask.copy() for name in found}
 
     def render(self) -> tuple[Array, ...] | None:
         """One (H, W, 3) uint8 picture per environment."""
-        if self.render_mode is None or self._record is None:
+        if self.render_mode is None or self._flights is None:
             return None
         from fdi_gym.plots import Canvas
 
         if self._canvas is None:
-            self._canvas = Canvas(self.plant, self._game.task)
-        return tuple(
-            self._canvas.draw(Record(*(a[i : i + 1] for a in self._record)), int(self._k[i]), self._declared[i])
-            for i in range(self.num_envs)
-        )
+            self._canvas = Canvas(self.plant, self._rules.task)
+        for i, scenario in enumerate(self.scenarios):
+            if i not in self._records and scenario is not None:
+                self._records[i] = simulate(self.plant, [scenario])
+        return tuple(self._canvas.draw(self._records[i], int(self._k[i]), self._declared[i]) for i in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the canvas."""

@@ -26,7 +26,7 @@ from fdi_gym.names import blamed, file_name
 from fdi_gym.plant import Plant
 from fdi_gym.provenance import provenance
 from fdi_gym.row import Evaluated, Made, Row, outcomes_digest
-from fdi_gym.simulation import Record, simulate
+from fdi_gym.engine import Record, simulate
 from fdi_gym.suite import Suite
 
 BLOCK = 50  # episodes flown and diagnosed together

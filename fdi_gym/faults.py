@@ -314,7 +314,12 @@ class Streams(NamedTuple):
 
 def streams(seed: int) -> Streams:
     """The random streams that belong to an episode's seed."""
-    return Streams(*np.random.SeedSequence(seed).spawn(4))
+    return Streams(*(_stream(seed, name) for name in Streams._fields))
+
+
+def _stream(seed: int, name: str) -> np.random.SeedSequence:
+    """One of them: what `SeedSequence(seed).spawn(4)` gives in its place."""
+    return np.random.SeedSequence(seed, spawn_key=(Streams._fields.index(name),))
 
 
 def draw(
@@ -329,15 +334,14 @@ def draw(
         seed: The episode's seed, as given to `reset`.
         perturb: Draws the truth's physical parameters in place of those the process drew.
     """
-    stream = streams(seed)
-    scenario = process.sample(np.random.default_rng(stream.scenario))
+    scenario = process.sample(np.random.default_rng(_stream(seed, "scenario")))
     if not isinstance(scenario, FaultScenario):
         raise TypeError(f"the fault process {process.name!r} draws a FaultScenario, not {type(scenario).__name__}")
-    changes: dict[str, Any] = {"noise_seed": int(stream.noise.generate_state(1, np.uint64)[0] >> np.uint64(1))}
+    changes: dict[str, Any] = {"noise_seed": int(_stream(seed, "noise").generate_state(1, np.uint64)[0] >> np.uint64(1))}
     if process.initial is not None:
-        changes["x0"] = [float(v) for v in process.initial(np.random.default_rng(stream.initial))]
+        changes["x0"] = [float(v) for v in process.initial(np.random.default_rng(_stream(seed, "initial")))]
     if perturb is not None:
-        changes["physical"] = dict(perturb(np.random.default_rng(stream.physical)))
+        changes["physical"] = dict(perturb(np.random.default_rng(_stream(seed, "physical"))))
     return scenario.replace(**changes)
 
 

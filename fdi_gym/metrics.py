@@ -14,9 +14,9 @@ import msgspec
 import numpy as np
 
 from fdi_gym.diagnosis import Decisions
+from fdi_gym.engine import Record
 from fdi_gym.faults import Scoring
 from fdi_gym.plant import Array, Plant
-from fdi_gym.simulation import Record
 
 PHASES = ("before", "during", "after")  # before the first fault, while a fault acts, healthy again after one
 BANDS = ("small", "medium", "large")

@@ -216,7 +216,7 @@ class Plant:
             to a singularity; diagnosers never see them.
         quaternions: Outputs that are a quaternion known up to its sign: the positions of its vector part (3) and of the
             sign of its scalar part, for each.
-        noise: Draws (w (steps, n_x), v (steps + 1, n_y)) from a Generator. Default: white, row by row, v before w.
+        noise_limit: The white noise of sensors and states is clipped at so many standard deviations. Default: never.
         isolation_reward: (labels, labels): reward of declaring column while row is true. Default: 1 if right, else 0.
         identification_reward: Reward of an error (..., n). Default: minus the squares, scaled.
     """
@@ -251,7 +251,7 @@ class Plant:
     monitor: Callable[[Array], Mapping[str, Array]] = _nothing
     shapes: Shapes = OPEN
     quaternions: tuple[tuple[int, int, int, int], ...] = ()
-    noise: Callable[[np.random.Generator, int], tuple[Array, Array]] | None = None
+    noise_limit: float = np.inf
     isolation_reward: Array | None = None
     identification_reward: Callable[[Array], Array] | None = None
 
@@ -366,9 +366,18 @@ class Plant:
     def label_rows(self, scenario: FaultScenario) -> Array:
         """The true label at the samples 0..K: sample k has that of the fault which acted over [k - 1, k)."""
         rows = np.zeros(scenario.steps + 1, dtype=np.int64)
-        for start, stop, active in self.label_intervals(scenario):
-            rows[start + 1 : stop + 1] = self.label_of(active)
+        for first, label in self.label_changes(scenario):
+            rows[first:] = label
         return rows
+
+    def label_changes(self, scenario: FaultScenario) -> list[tuple[int, int]]:
+        """The true label as (first sample, label), in order: sample k has that of the fault which acted over [k - 1, k)."""
+        changes = [(0, 0)]
+        for start, _, active in self.label_intervals(scenario):
+            label = self.label_of(active)
+            if label != changes[-1][1]:
+                changes.append((start + 1, label))
+        return changes
 
     def validate(self, scenario: FaultScenario) -> None:
         """Whether a scenario fits this plant, whole: every flight asks before a kernel sees it.
@@ -488,31 +497,31 @@ class Plant:
         episode share their command). t [s] is a number or one per such group. theta, d and the physical parameters p
         default to nominal, none and the model's.
         """
-        from fdi_gym import kernels
+        from fdi_gym import integration
 
         x = np.asarray(x, float)
         rows = self._rows_of(t, x, u, theta, d, p, len(self.states))
-        kernels.propagate(self.addresses[0], self.addresses[4], self.dt, self.substeps, *rows)
+        integration.propagate(self.addresses[0], self.addresses[4], self.dt, self.substeps, *rows)
         return rows[-1].reshape(x.shape)
 
     def measure(
         self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None, p: Array | None = None
     ) -> Array:
         """The noise-free sensor values at x (..., n_x); arguments as in `propagate`, u held up to t."""
-        from fdi_gym import kernels
+        from fdi_gym import integration
 
         x = np.asarray(x, float)
         rows = self._rows_of(t, x, u, theta, d, p, len(self.outputs))
-        kernels.evaluate(self.addresses[1], *rows)
+        integration.evaluate(self.addresses[1], *rows)
         return rows[-1].reshape(*x.shape[:-1], len(self.outputs))
 
     def derivative(self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None) -> Array:
         """xdot at x (..., n_x); arguments as in `propagate`. For a discrete plant it is the next state."""
-        from fdi_gym import kernels
+        from fdi_gym import integration
 
         x = np.asarray(x, float)
         rows = self._rows_of(t, x, u, theta, d, None, len(self.states))
-        kernels.evaluate(self.addresses[0], *rows)
+        integration.evaluate(self.addresses[0], *rows)
         return rows[-1].reshape(x.shape)
 
     @functools.cached_property

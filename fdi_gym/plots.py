@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from fdi_gym.engine import Record
 from fdi_gym.plant import Array, Plant
-from fdi_gym.simulation import Record
 
 INK, TRUTH, SAID, SHADE = "#333333", "#1b6ca8", "#d1495b", "#f3dcd4"
 

@@ -27,7 +27,7 @@ from fdi_gym.faults import draw
 from fdi_gym.metrics import outcome
 from fdi_gym.names import blamed
 from fdi_gym.plant import Plant, load_plant, plant_sources
-from fdi_gym.simulation import simulate
+from fdi_gym.engine import simulate
 
 _LIBRARIES = tuple(Path(p).resolve() for p in {*sysconfig.get_paths().values(), sys.prefix, sys.base_prefix})
 _SYSTEM = tuple(Path(p) for p in ("/proc", "/sys", "/dev", "/etc"))

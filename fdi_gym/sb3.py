@@ -17,6 +17,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from fdi_gym.plant import Array
+from fdi_gym.rules import checked_seed, whole
+
+# what each environment has for itself, by the name that the vector environment has it under
+OWN = {"scenario": "scenarios", "np_random": "np_random", "np_random_seed": "np_random_seed"}
 
 
 class FDIVecEnv(VecEnv):
@@ -28,7 +32,7 @@ class FDIVecEnv(VecEnv):
     the next reset.
 
     Args:
-        envs: A vector environment with `autoreset_mode="SameStep"`.
+        envs: A vector environment with `autoreset_mode="SameStep"`; `truth=False` suits it.
 
     Raises:
         ValueError: Another autoreset mode.
@@ -38,21 +42,53 @@ class FDIVecEnv(VecEnv):
         if envs.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
             raise ValueError("SB3 begins an episode in the step that ends one: autoreset_mode='SameStep' is needed")
         self.envs = envs
-        self.truth: dict[str, Array] = {}
         self._actions: Any = None
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
+    @property
+    def truth(self) -> dict[str, Array]:
+        """The truth to which the next actions will be compared: label, target, theta, time and what the plant monitors."""
+        return self.envs.unwrapped.truth()  # type: ignore[attr-defined]
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seeds of the next reset: the first environment's, the next ones follow.
+
+        Raises:
+            ValueError, TypeError: Not a whole number from 0 on.
+        """
+        return super().seed(checked_seed(seed))
+
+    def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:
+        """Options of the next reset, which all environments share: a dict, or one equal dict for each.
+
+        Raises:
+            ValueError, TypeError: Not that.
+        """
+        each = [options or {}] * self.num_envs if options is None or isinstance(options, dict) else options
+        if not isinstance(each, list) or not all(isinstance(entry, dict) for entry in each):
+            raise TypeError(f"the options of a reset are a dict, or a list of them, not {options!r}")
+        if len(each) != self.num_envs or any(entry is not each[0] and entry != each[0] for entry in each):
+            raise ValueError(f"the {self.num_envs} environments share the options of a reset; they were given {options!r}")
+        if "reset_mask" in each[0]:
+            raise ValueError("unknown option 'reset_mask' of venv.reset(), which is for all; see env_method('reset')")
+        super().set_options(each)
+
     def reset(self) -> Array:
-        """Begin an episode in every environment, with the seeds and options that were set before."""
+        """Begin an episode in every environment, with the seeds and options that were set before.
+
+        Raises:
+            ValueError, TypeError: Options that the environments do not have.
+        """
         options = self._options[0]
-        if any(other != options for other in self._options):
-            raise ValueError("the environments share the options of a reset; they were given different ones")
-        obs, infos = self.envs.reset(seed=list(self._seeds), options=options or None)  # type: ignore[arg-type]
-        self.truth = self._read(infos)
-        self.reset_infos = [{name: value[i] for name, value in self.truth.items()} for i in range(self.num_envs)]
+        obs, _ = self.envs.reset(seed=list(self._seeds), options=options or None)  # type: ignore[arg-type]
+        self.reset_infos = self._infos(range(self.num_envs))
         self._reset_seeds()
         self._reset_options()
         return obs
+
+    def _infos(self, indices: Iterable[int]) -> list[dict[str, Any]]:
+        truth = self.truth
+        return [{name: value[i] for name, value in truth.items()} for i in indices]
 
     def step_async(self, actions: Array) -> None:
         """Keep the actions for `step_wait`."""
@@ -61,19 +97,15 @@ class FDIVecEnv(VecEnv):
     def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:  # type: ignore[override]
         """Step: observations, rewards (float32), dones, infos."""
         obs, rewards, terminated, truncated, infos = self.envs.step(self._actions)
-        self.truth = self._read(infos)
         dones = terminated | truncated
         unpacked: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(dones):
             unpacked[i] = {
-                **{name: value[i] for name, value in self._read(infos["final_info"]).items()},
+                **{name: value[i] for name, value in infos["final_info"].items() if not name.startswith("_")},
                 "terminal_observation": infos["final_obs"][i],
                 "TimeLimit.truncated": bool(truncated[i]),
             }
         return obs, rewards.astype(np.float32), dones, unpacked
-
-    def _read(self, infos: dict[str, Any]) -> dict[str, Array]:
-        return {name: infos[name] for name in ("label", "target", "theta", "time")}
 
     def close(self) -> None:
         """Close the vector environment."""
@@ -83,11 +115,25 @@ class FDIVecEnv(VecEnv):
         """One picture per environment (`render_mode="rgb_array"`)."""
         return list(self.envs.render() or [None] * self.num_envs)  # type: ignore[return-value]
 
+    def _get_indices(self, indices: Any) -> list[int]:
+        """The environments meant.
+
+        Raises:
+            ValueError, TypeError: There is none of that number.
+        """
+        if indices is None:
+            return list(range(self.num_envs))
+        found = [whole("the index of an environment", i, 0) for i in ([indices] if np.ndim(indices) == 0 else indices)]
+        if any(i >= self.num_envs for i in found):
+            raise ValueError(f"there are the environments 0 to {self.num_envs - 1}, not {found}")
+        return found
+
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute as the single environments have it: their own scenario, else what they share."""
-        which = list(self._get_indices(indices))
-        if attr_name == "scenario":
-            return [self.envs.unwrapped.scenarios[i] for i in which]  # type: ignore[attr-defined]
+        """An attribute as the single environments have it: their own where each has one, else what they share."""
+        which = self._get_indices(indices)
+        if attr_name in OWN:
+            own = getattr(self.envs.unwrapped, OWN[attr_name])
+            return [own[i] for i in which]
         if attr_name in ("observation_space", "action_space"):
             return [getattr(self, attr_name)] * len(which)
         return [self._shared(attr_name)] * len(which)
@@ -100,19 +146,46 @@ class FDIVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute of all environments; they share it, so one alone cannot have it."""
-        if len(set(self._get_indices(indices))) != self.num_envs:
-            raise ValueError(f"the environments share {attr_name!r}: set it for all of them")
+        if attr_name in OWN or len(set(self._get_indices(indices))) != self.num_envs:
+            raise ValueError(f"{attr_name!r} cannot be set for one environment, and what they share is set for all of them")
         setattr(self.envs.unwrapped, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Call a method once for all environments; what it returns per environment is handed out, the rest is shared."""
-        which: Iterable[int] = list(self._get_indices(indices))
-        if method_name in ("get_wrapper_attr", "has_wrapper_attr"):
-            found = self.has_attr(*method_args) if method_name[0] == "h" else self.get_attr(*method_args)
-            return [found if isinstance(found, bool) else found[i] for i in which]
-        answer = self._shared(method_name)(*method_args, **method_kwargs)
-        split = isinstance(answer, (tuple, list, np.ndarray)) and len(answer) == self.num_envs
-        return [answer[i] if split else answer for i in which]
+        """Call a method of the environments: `reset` and `render` of each that is meant, any other once for all of them.
+
+        Raises:
+            ValueError: A method that they share, for some of them only; `step`, which is for all at once.
+        """
+        which = self._get_indices(indices)
+        if method_name == "reset":
+            return self._reset_some(which, *method_args, **method_kwargs)
+        if method_name == "render":
+            pictures = self.envs.render(*method_args, **method_kwargs)
+            return [None if pictures is None else pictures[i] for i in which]
+        if method_name == "get_wrapper_attr":
+            return self.get_attr(*method_args, indices=which, **method_kwargs)
+        if method_name == "has_wrapper_attr":
+            return [self.has_attr(*method_args, **method_kwargs)] * len(which)
+        if method_name == "step" or len(set(which)) != self.num_envs:
+            raise ValueError(
+                f"the environments share {method_name!r}: reset and render are for one alone, step is venv.step"
+            )
+        return [self._shared(method_name)(*method_args, **method_kwargs)] * len(which)
+
+    def _reset_some(self, which: list[int], seed: Any = None, options: Any = None) -> list[tuple[Array, dict[str, Any]]]:
+        """What `reset(seed=..., options=...)` of each of these environments gives."""
+        mask = np.zeros(self.num_envs, bool)
+        mask[which] = True
+        seed = checked_seed(seed)
+        seeds = [seed if meant else None for meant in mask]
+        if options is not None and not isinstance(options, dict):
+            raise TypeError(f"the options of a reset are a dict, not {options!r}")
+        if "reset_mask" in (options or {}):
+            raise ValueError("unknown option 'reset_mask' of an environment's reset; indices say which are meant")
+        if not which:
+            return []
+        obs, _ = self.envs.reset(seed=seeds, options={**(options or {}), "reset_mask": mask})  # type: ignore[arg-type]
+        return [(obs[i], info) for i, info in zip(which, self._infos(which), strict=True)]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         """Whether the vector environment is wrapped with this class."""
@@ -130,9 +203,14 @@ def make_vec_env(env_id: str, num_envs: int, seed: int | None = None, **argument
         env_id: Gymnasium id.
         num_envs: How many.
         seed: Of the first environment at the first reset; the next ones follow.
-        arguments: Of the environment (`units`, `decision_period`, `scenario`, ...).
+        arguments: Of the environment (`units`, `decision_period`, `process`, ...). `truth` is False where it is not given:
+            the bridge asks for it when it is wanted.
+
+    Raises:
+        ValueError, TypeError: As the environment.
     """
-    venv = FDIVecEnv(gym.make_vec(env_id, num_envs=num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **arguments))
+    arguments = {"truth": False, **arguments, "autoreset_mode": AutoresetMode.SAME_STEP}
+    venv = FDIVecEnv(gym.make_vec(env_id, num_envs=num_envs, **arguments))
     if seed is not None:
         venv.seed(seed)
     return venv

@@ -17,10 +17,10 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from fdi_gym.checks import check_declaration
 from fdi_gym.diagnosis import Decisions, Diagnoser, guarded, run
+from fdi_gym.engine import Record, no_noise, simulate
 from fdi_gym.envs import FDIEnv, FDIVectorEnv
 from fdi_gym.faults import Fault, FaultScenario, Incipient, Intermittent, draw, streams
 from fdi_gym.plant import Array, Plant, Signal
-from fdi_gym.simulation import Record, no_noise, simulate
 
 
 def check_plant(plant: Plant, seeds: Sequence[int] = range(5)) -> None:
@@ -186,9 +186,9 @@ def _check_linear(plant: Plant) -> None:
         assert worst <= 1e-9, f"the plant calls itself linear, but is not in {what}: off by {worst:.3g}"
 
 
-def _with_short_episodes(plant: Plant, scenario: str, lengths: Sequence[int]) -> Plant:
+def _with_short_episodes(plant: Plant, process: str, lengths: Sequence[int]) -> Plant:
     """The plant with a process "short": the named one, squeezed into episodes of these lengths."""
-    base = plant.process(scenario)
+    base = plant.process(process)
 
     def short(rng: np.random.Generator) -> FaultScenario:
         drawn = base.sample(rng)
@@ -203,8 +203,8 @@ def _with_short_episodes(plant: Plant, scenario: str, lengths: Sequence[int]) ->
         ]
         return drawn.replace(steps=steps, faults=faults)
 
-    process = dataclasses.replace(base, name="short", sample=short)
-    return dataclasses.replace(plant, processes={**plant.processes, "short": process})
+    squeezed = dataclasses.replace(base, name="short", sample=short)
+    return dataclasses.replace(plant, processes={**plant.processes, "short": squeezed})
 
 
 def check_vector_env(
@@ -213,7 +213,7 @@ def check_vector_env(
     steps: int = 300,
     seed: int = 7,
     lengths: Sequence[int] = (40, 65, 90),
-    scenario: str = "standard",
+    process: str = "standard",
     **kwargs: Any,
 ) -> None:
     """The vector environment equals n single ones, sample by sample, with episodes that end at different times.
@@ -227,11 +227,11 @@ def check_vector_env(
         steps: Steps in each mode.
         seed: Of the first reset and of the actions.
         lengths: Episode lengths that occur, in samples.
-        scenario: The fault process that is squeezed into them.
+        process: The fault process that is squeezed into them.
         kwargs: Further arguments of the environments (task, decision_period, units, mismatch).
     """
-    cut = _with_short_episodes(plant, scenario, lengths)
-    kwargs = {**kwargs, "scenario": "short"}
+    cut = _with_short_episodes(plant, process, lengths)
+    kwargs = {**kwargs, "process": "short"}
     rng = np.random.default_rng(seed)
     for mode in AutoresetMode:
         many, again = (FDIVectorEnv(cut, num_envs=n, autoreset_mode=mode, **kwargs) for _ in range(2))
@@ -255,7 +255,7 @@ def check_vector_env(
             over = left[2] | left[3]
             ends += int(over.sum())
         assert ends >= n, f"{mode}: only {ends} episodes ended in {steps} steps: nothing was tested"
-    _check_no_truth(plant, plant.process(scenario).sample(np.random.default_rng(seed)))
+    _check_no_truth(plant, plant.process(process).sample(np.random.default_rng(seed)))
 
 
 def _action(env: FDIVectorEnv, rng: np.random.Generator) -> Array:

@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from fdi_gym.plant import Array
+from fdi_gym.rules import whole
 
 
 class VectorHistory(VectorWrapper):
@@ -29,6 +30,7 @@ class VectorHistory(VectorWrapper):
 
     Raises:
         ValueError: length or stride below 1, or another observation space.
+        TypeError: length or stride is no whole number.
     """
 
     def __init__(self, env: VectorEnv, length: int, stride: int = 1):
@@ -36,8 +38,7 @@ class VectorHistory(VectorWrapper):
         space = env.single_observation_space
         if not isinstance(space, Box):
             raise ValueError(f"a window of Box observations is made, not of {space}")
-        if length < 1 or stride < 1:
-            raise ValueError(f"length and stride are at least 1, not {length} and {stride}")
+        length, stride = whole("length", length, 1), whole("stride", stride, 1)
         low, high = (np.repeat(bound[None], length, axis=0) for bound in (space.low, space.high))
         self.single_observation_space = Box(low, high, dtype=space.dtype)  # type: ignore[arg-type]
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
@@ -91,7 +92,7 @@ class DelayAwareReward(VectorWrapper):
     sample is worth 0, as in the environment.
 
     Args:
-        env: A vector environment of the isolation task, whose `infos` hold the truth.
+        env: A vector environment of this package with the isolation task.
         patience: Steps after which a wrong label costs as much as a right one earns.
         weights: One per label. Default: 1 each.
 
@@ -105,8 +106,10 @@ class DelayAwareReward(VectorWrapper):
         if labels is None:
             raise ValueError("the delay-aware reward judges labels: the task is isolation")
         self._weights = np.ones(labels) if weights is None else np.asarray(weights, float)
-        if self._weights.shape != (labels,):
-            raise ValueError(f"one weight per label is needed: {labels}, not {self._weights.shape}")
+        if self._weights.shape != (labels,) or not np.isfinite(self._weights).all():
+            raise ValueError(f"one weight per label is needed: {labels} numbers, not {weights!r}")
+        if not (patience > 0 and np.isfinite(patience)):
+            raise ValueError(f"patience is a number of steps above 0, not {patience!r}")
         self._patience = patience
         self._label = np.zeros(env.num_envs, np.int64)
         self._since = np.zeros(env.num_envs)  # steps since the label changed
@@ -122,21 +125,24 @@ class DelayAwareReward(VectorWrapper):
         mask = (options or {}).get("reset_mask")
         begun = np.ones(self.num_envs, bool) if mask is None else mask
         self._over &= ~begun
-        self._follow(np.where(begun, infos["label"], self._label), begun)
+        self._follow(np.where(begun, self._now(), self._label), begun)
         return obs, infos
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Step every environment and judge its action."""
+        obs, _, terminated, truncated, infos = self.env.step(actions)  # refuses what is no label, before anything changes
         right = np.asarray(actions) == self._label
         late = np.where(self._found, 1.0, np.minimum(1.0, self._since / self._patience))
         rewards = np.where(self._first | self._over, 0.0, self._weights[self._label] * np.where(right, 1.0, -late))
         self._found |= right
-        obs, _, terminated, truncated, infos = self.env.step(actions)
         ended = terminated | truncated
         begun = ended if self._mode is AutoresetMode.SAME_STEP else self._over
         self._over = ended & (self._mode is not AutoresetMode.SAME_STEP)
-        self._follow(infos["label"], begun)
+        self._follow(self._now(), begun)
         return obs, rewards, terminated, truncated, infos
+
+    def _now(self) -> Array:
+        return self.env.unwrapped.truth("label")["label"]  # type: ignore[attr-defined]
 
     def _follow(self, label: Array, begun: Array) -> None:
         changed = begun | (label != self._label)

@@ -12,8 +12,8 @@ import pytest
 
 from fdi_gym.diagnosis import filtering, fitting, knowledge
 from fdi_gym.estimation.decision import Rule, Verdict
+from fdi_gym.engine import simulate
 from fdi_gym.plant import Plant, load_plant, plant_sources
-from fdi_gym.simulation import simulate
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "examples"))

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from conftest import build
 
+from fdi_gym.engine import no_noise, simulate
 from fdi_gym.estimation.linear import linear_model
 from fdi_gym.faults import draw
 from fdi_gym.plants import b747_lateral as b747
-from fdi_gym.simulation import no_noise, simulate
 
 
 def numbers(text):

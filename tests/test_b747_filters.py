@@ -13,10 +13,10 @@ from fdi_gym.diagnosis import Diagnosis, NotApplicableError, make_diagnoser, run
 from fdi_gym.estimation.calibration import Persistence, uniform
 from fdi_gym.estimation.decision import Reading, by_candidate, by_labels
 from fdi_gym.estimation.labels import closest, distances, manifolds
+from fdi_gym.engine import simulate
 from fdi_gym.estimation.linear import linear_model
 from fdi_gym.faults import draw
 from fdi_gym.plants import b747_lateral as b747
-from fdi_gym.simulation import simulate
 
 U = np.array([[1.0, 0.5], [-1.0, 0.25], [0.5, -0.75], [2.0, 1.0], [0.0, -0.5]])
 Y = np.array([[0.05, -0.02, -0.03, 0.10], [0.00, 0.01, -0.06, -0.05], [-0.04, -0.03, 0.02, 0.08],

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import fdi_gym
+from fdi_gym.engine import no_noise, simulate
 from fdi_gym.faults import Fault, FaultScenario, Samples, draw
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
-from fdi_gym.simulation import no_noise, simulate
 
 DELTA = np.array([0.3, -0.2, 0.5, 0.1])
 Q = np.array([0.1, -0.2, 0.3, np.sqrt(0.86)])
@@ -220,10 +220,10 @@ def test_integration_order():
     r = np.array([[8.0, -6.0, 5.0, 7.0]])
 
     def end(substeps, h=0.08):
-        from fdi_gym import kernels
+        from fdi_gym import integration
 
         out = np.empty((1, 11))
-        kernels.propagate(plant.addresses[0], plant.addresses[4], h, substeps, np.zeros(1), x[None], r, F,
+        integration.propagate(plant.addresses[0], plant.addresses[4], h, substeps, np.zeros(1), x[None], r, F,
                           np.zeros((1, 0)), plant.nominal_p[None], out)  # fmt: skip
         return out[0]
 
@@ -395,14 +395,14 @@ def test_environment(task):
 
 def test_info_reports_the_distance_to_a_singularity(plant):
     """info["det"] is det(A A') of the recorded state, in both environments, and diagnosers don't see it."""
-    env = gym.make("CMGSatellite-Faults-v0", scenario="hard")
+    env = gym.make("CMGSatellite-Faults-v0", process="hard")
     _, info = env.reset(seed=4)
     infos = [info, *(env.step(0)[4] for _ in range(300))]
     state = simulate(plant, [env.unwrapped.scenario]).state[0, :301]
     A, _ = cmg.cluster(state[:, 7:])
     assert [i["det"] for i in infos] == cmg.singularity(state[:, 7:]).tolist()
     close([i["det"] for i in infos], np.linalg.det(A @ np.swapaxes(A, 1, 2)))
-    many = gym.make_vec("fdi_gym:CMGSatellite-Faults-v0", num_envs=2, scenario="hard")
+    many = gym.make_vec("fdi_gym:CMGSatellite-Faults-v0", num_envs=2, process="hard")
     many.reset(seed=[4, 5])
     for k in range(1, 30):
         assert many.step(np.zeros(2, int))[4]["det"][0] == infos[k]["det"]

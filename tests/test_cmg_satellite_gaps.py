@@ -13,7 +13,7 @@ from fdi_gym.estimation.gaussian import unscented
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
-from fdi_gym.simulation import simulate
+from fdi_gym.engine import simulate
 
 UKFS = ("joint_ukf", "dual_ukf", "caukf", "gaukf", "sgaukf", "sgaukf_odd", "dual_caukf", "dual_gaukf", "dual_sgaukf",
         "dual_sgaukf_odd")  # fmt: skip

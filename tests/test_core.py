@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from conftest import ROOT, build
 
-from fdi_gym import kernels
+from fdi_gym import integration, kernels
+from fdi_gym.engine import no_noise, simulate, white_noise
 from fdi_gym.faults import (
     Abrupt,
     Fault,
@@ -26,7 +27,6 @@ from fdi_gym.faults import (
 )
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import b747_lateral as b747
-from fdi_gym.simulation import no_noise, simulate, white_noise
 
 MOTOR = {"reference": {"levels": [100.0]}, "disturbance": {"load": 0.02}}
 
@@ -38,7 +38,7 @@ def test_rk4_is_of_fourth_order(motor):
     address, project = kernels.address(motor.kernels.dynamics), kernels.address(kernels.project)
     for n in steps:
         out = np.empty((1, 2))
-        kernels.propagate(address, project, 8e-3, n, np.zeros(1), x, np.array([[12.0]]), np.array([[1.0, 0.5, 0.0]]),
+        integration.propagate(address, project, 8e-3, n, np.zeros(1), x, np.array([[12.0]]), np.array([[1.0, 0.5, 0.0]]),
                           np.array([[0.02]]), motor.nominal_p[None], out)  # fmt: skip
         flow[n] = out
     error = [np.abs(flow[n] - flow[2048]).max() for n in steps[:3]]

@@ -12,7 +12,7 @@ from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.equivalent import has_equivalents, nearest
 from fdi_gym.faults import draw
 from fdi_gym.plant import load_plant, plant_sources
-from fdi_gym.simulation import simulate
+from fdi_gym.engine import simulate
 
 PLANTS = [load_plant(name) for name in plant_sources()]
 DECLARING = [plant for plant in PLANTS if has_equivalents(plant)]

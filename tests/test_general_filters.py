@@ -23,7 +23,7 @@ from fdi_gym.estimation.labels import Manifolds, nearest_of
 from fdi_gym.estimation.linear import linear_model
 from fdi_gym.faults import draw
 from fdi_gym.plants import b747_lateral as b747_file
-from fdi_gym.simulation import simulate
+from fdi_gym.engine import simulate
 
 ALL_PLANTS = [*PLANTS, "DCMotor"]
 SMALL = 5e-3

@@ -20,8 +20,8 @@ from fdi_gym.diagnosis.fitting import flights_of
 from fdi_gym.estimation import mixing
 from fdi_gym.estimation.gaussian import jacobian
 from fdi_gym.estimation.linear import linear_model
+from fdi_gym.engine import no_noise, simulate
 from fdi_gym.faults import draw
-from fdi_gym.simulation import no_noise, simulate
 
 FLIGHTS = 3
 

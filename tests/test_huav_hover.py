@@ -8,10 +8,11 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import fdi_gym  # noqa: F401 (registers the environments)
+from baselines.reproduction.numbered import fly
+from fdi_gym.engine import no_noise, simulate
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import huav_hover as huav
-from fdi_gym.simulation import no_noise, simulate
 
 KAPPAS = (0.0, 0.3, 1.0)
 X = np.array([0.5, -0.4, 0.3, 0.10, -0.20, 0.15, 0.12, -0.08, 0.50, 0.010, -0.020])
@@ -206,8 +207,8 @@ def test_drift_is_drawn_in_the_prescribed_order():
     assert np.array(fault.effects[1].values) == pytest.approx(huav.U_TRIM[c] + np.array(s), abs=1e-15)
 
 
-def test_noise_stream_is_process_then_sensor(plant):
-    w, v = plant.noise(np.random.default_rng(7), 5)
+def test_noise_of_the_numbered_flights_is_process_then_sensor():
+    w, v = huav.prescribed_noise(np.random.default_rng(7), 5)
     g = np.random.default_rng(7)
     assert np.array_equal(w, g.standard_normal((5, 11)) * huav.SIGMA_W)
     assert np.array_equal(v, g.standard_normal((6, 9)) * huav.SIGMA_V)
@@ -333,9 +334,9 @@ def test_environment(task):
 @pytest.mark.slow
 @pytest.mark.parametrize(("kappa", "share"), [(0.0, 0.08), (0.3, 0.08), (1.0, 0.14)])
 def test_share_of_lost_flights(kappa, share):
-    flown = simulate(load_plant(huav.ID, kappa=kappa), [huav.episode(s) for s in range(100)])
+    flown = fly(load_plant(huav.ID, kappa=kappa), [huav.episode(s) for s in range(100)], huav.prescribed_noise)
     assert flown.terminated.mean() == pytest.approx(share)
-    healthy = simulate(load_plant(huav.ID, kappa=kappa), [huav.fault_free_episode(s) for s in range(100)])
+    healthy = fly(load_plant(huav.ID, kappa=kappa), [huav.fault_free_episode(s) for s in range(100)], huav.prescribed_noise)
     assert not healthy.terminated.any()
 
 
@@ -350,7 +351,7 @@ def test_share_of_lost_flights(kappa, share):
 ])  # fmt: skip
 def test_closed_loop_over_24_seeds(number, kappa, angles, speeds, rates):
     plant = load_plant(huav.ID, kappa=kappa)
-    record = simulate(plant, [huav.paper(number).replace(noise_seed=s) for s in range(100, 124)])
+    record = fly(plant, [huav.paper(number).replace(noise_seed=s) for s in range(100, 124)], huav.prescribed_noise)
     assert not record.terminated.any()
     most = np.abs(record.state).max(axis=(0, 1))
     assert np.degrees(most[6:8]) == pytest.approx(angles, abs=0.051)

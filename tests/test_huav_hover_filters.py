@@ -18,11 +18,12 @@ from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_channels
 from fdi_gym.estimation.labels import channel_sets, label_of_channels
 from fdi_gym.estimation.linear import linear_output
+from baselines.reproduction.numbered import fly
+from fdi_gym.engine import no_noise, simulate
 from fdi_gym.faults import FaultProcess, FaultScenario
 from fdi_gym.kernels import kernel
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal, load_plant
 from fdi_gym.plants import b747_lateral, huav_hover
-from fdi_gym.simulation import no_noise, simulate
 from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env
 
 PAPER = {"b0_std": 2e-3, "d0_std": 0.5, "b_step": 7e-4, "d_step": 0.05, "x0_std": [*[0.1] * 3, *[0.02] * 6, *[0.005] * 2]}
@@ -162,7 +163,7 @@ def test_filter_rows_on_the_noise_free_flight(plant, name, b, d):
 
 
 def test_hypothesis_bank_check_values(plant):
-    obs = simulate(plant, [huav_hover.episode(1)]).obs
+    obs = fly(plant, [huav_hover.episode(1)], huav_hover.prescribed_noise).obs
     diagnoser = build("hypothesis_bank", plant)
     state, seen = diagnoser.init(1), {}
     for k in range(522):
@@ -723,7 +724,7 @@ def test_matched_oracle_attributes_as_the_data_sheet_says(kappa, shares):
     scenarios = [s for s in map(huav_hover.episode, range(400)) if len(s.faults) == 1]
     assert len(scenarios) == 262
     plant = load_plant(huav_hover.ID, kappa=kappa)
-    record = simulate(plant, scenarios)
+    record = fly(plant, scenarios, huav_hover.prescribed_noise)
     said = run(build("matched_oracle", plant, scenarios=scenarios), record.obs)
     i, fault = np.arange(262), [s.faults[0] for s in scenarios]
     truth = np.array([1 + P4.index(f.mode) for f in fault])

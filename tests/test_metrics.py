@@ -5,9 +5,9 @@ import pytest
 from conftest import build
 
 from fdi_gym.diagnosis import Decisions
+from fdi_gym.engine import Record
 from fdi_gym.faults import Scoring
 from fdi_gym.metrics import balanced_accuracy, delay_quartiles, macro_f1, outcome, scored_samples, summarise
-from fdi_gym.simulation import Record
 
 LETTERS = {".": 0, "A": 1, "S": 2, "R": 3, "?": -1}
 

@@ -6,10 +6,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from baselines.filters import missile_model as model
+from fdi_gym.engine import no_noise, simulate
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import missile_pitch as missile
-from fdi_gym.simulation import no_noise, simulate
 
 DEG = np.pi / 180
 RHO = [0.05, -0.05, 0.03, 0.02, -0.04, 0.01]

@@ -20,10 +20,10 @@ from fdi_gym.estimation import mixing
 from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.calibration import Persistence
 from fdi_gym.estimation.decision import Reading
+from fdi_gym.engine import simulate
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import missile_pitch as missile
-from fdi_gym.simulation import simulate
 from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env
 
 FIVE = (1, 2, 3, 4, 5)
@@ -642,7 +642,7 @@ def test_plant_conformance(plant):
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"task": "identification", "units": "scaled"},
-                                    {"decision_period": 5, "mismatch": 0.02, "scenario": "hard"}])  # fmt: skip
+                                    {"decision_period": 5, "mismatch": 0.02, "process": "hard"}])  # fmt: skip
 def test_vector_env_conformance(plant, kwargs):
     check_vector_env(plant, n=3, steps=120, **kwargs)
 

@@ -17,8 +17,8 @@ from baselines.networks.identification import Shape
 from baselines.networks.observed import IdentifiedFeatures
 from baselines.networks.reinforcement import Recipe, Run
 from fdi_gym.diagnosis import make_diagnoser, run
+from fdi_gym.engine import simulate
 from fdi_gym.sb3 import FDIVecEnv, make_vec_env
-from fdi_gym.simulation import simulate
 from fdi_gym.testing import check_diagnoser
 from fdi_gym.wrappers import VectorHistory
 

@@ -32,7 +32,7 @@ from fdi_gym.faults import (
 )
 from fdi_gym.plant import Kernels, Label, PlantSource, load_plant, plant_sources
 from fdi_gym.shapes import OPEN
-from fdi_gym.simulation import no_noise, simulate
+from fdi_gym.engine import no_noise, simulate
 from fdi_gym.testing import _check_range, check_plant
 
 NAN, INF = math.nan, math.inf
@@ -454,7 +454,7 @@ def test_a_plant_flies_the_same_in_another_process(motor, make, flown):
 import sys, pickle
 sys.path.insert(0, {str(ROOT / "examples")!r})
 plants, scenarios = pickle.load(sys.stdin.buffer)
-from fdi_gym.simulation import simulate
+from fdi_gym.engine import simulate
 print([float(simulate(p, [s]).obs.sum()) for p, s in zip(plants, scenarios)])
 """
     sent = cloudpickle.dumps((plants, [flight(p) for p in plants]))

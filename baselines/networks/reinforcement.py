@@ -31,9 +31,9 @@ from baselines.networks.identification import Model, Shape
 from baselines.networks.observed import IdentifiedFeatures
 from baselines.networks.policy import actor_tensors, streaming
 from fdi_gym.diagnosis import run
+from fdi_gym.engine import Record
 from fdi_gym.plant import Array
 from fdi_gym.sb3 import FDIVecEnv
-from fdi_gym.simulation import Record
 from fdi_gym.wrappers import DelayAwareReward
 
 HEAVIEST = 10.0  # weight of a rare label's reward
@@ -152,7 +152,7 @@ class Run:
         """The environments of one process, as the policy sees and is rewarded by them."""
         r, plant = self.recipe, self.plants[index]
         source = r.sources[index]
-        arguments: dict[str, Any] = {"task": r.task, "scenario": source.process, "decision_period": r.shape.period}
+        arguments: dict[str, Any] = {"task": r.task, "process": source.process, "decision_period": r.shape.period}
         arguments |= {"autoreset_mode": AutoresetMode.SAME_STEP, **source.options}
         arguments["units"] = "physical" if r.task == "isolation" else "scaled"  # an action in [-1, 1] is learned best
         envs: Any = gym.make_vec(plant.env_id, num_envs=r.envs, **arguments)

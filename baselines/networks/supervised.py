@@ -22,8 +22,8 @@ from baselines.networks import flights as data
 from baselines.networks.flights import CALIBRATION, PER_SEED, TRAINING, VALIDATION, Flights, Source
 from baselines.networks.identification import Model, Shape
 from baselines.networks.network import SequenceNetwork, loss
+from fdi_gym.engine import Record
 from fdi_gym.plant import Array
-from fdi_gym.simulation import Record
 
 RAREST = 2e-3  # share below which a label's weight grows no more
 

@@ -21,11 +21,11 @@ from baselines.filters.attitude import require_attitude
 from baselines.filters.mekf import first_covariance, observation, transition
 from baselines.oracles.mekf_clairvoyant import changes
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
+from fdi_gym.engine import simulate
 from fdi_gym.estimation.kalman import T, right_divide, symmetric
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.cmg_satellite import SETS, SIGMA_Q
-from fdi_gym.simulation import simulate
 
 P_PRIOR = 0.25  # variance of each effectiveness at a change
 Q_FLOOR = 1e-8  # rad/s per step: process noise of the bound where there is none

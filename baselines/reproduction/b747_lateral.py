@@ -27,11 +27,12 @@ from baselines.reproduction.b747_reference import (
     RANDOM,
     RMSE,
 )
+from baselines.reproduction.numbered import fly
 from baselines.reproduction.tables import compared, markdown, pieces
 from fdi_gym.diagnosis import Decisions, make_diagnoser, run
+from fdi_gym.engine import Record
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.plant import Array, Plant, load_plant
-from fdi_gym.simulation import Record, simulate
 
 GROUPS = 20  # the reference's seeds, with 20 episodes each
 DT = 0.1
@@ -59,7 +60,7 @@ DETECTORS = {"(1, 0.9999)": (1, 0.9999), "(50, 0.9999)": (50, 0.9999), "(50, 0.9
 def watch(plant: Plant, scenarios: list[FaultScenario], method: str) -> tuple[Record, Decisions]:
     """Fly the scenarios and show them to a method."""
     name, settings = METHODS[method]
-    record = simulate(plant, scenarios)
+    record = fly(plant, scenarios)
     return record, run(make_diagnoser(name, plant, scenarios=scenarios, **settings), record.obs)
 
 
@@ -185,7 +186,7 @@ def nis_piece(variant: str, window: int, confidence: float, seed: int, per_group
     plant = load_plant("B747Lateral", variant=variant)
     scenarios = episodes(plant, "standard", GROUPS * per_group, seed)
     build = lambda: make_diagnoser("windowed_nis", plant, window=window, confidence=confidence)  # noqa: E731
-    alarm = run(build(), simulate(plant, scenarios).obs).alarm
+    alarm = run(build(), fly(plant, scenarios).obs).alarm
     onset = np.array([s.faults[0].onset if s.faults else 10**6 for s in scenarios])
     first = np.array([np.flatnonzero(row)[0] if row.any() else -1 for row in alarm])
     detected = (onset < 10**6) & (first > onset)
@@ -194,7 +195,7 @@ def nis_piece(variant: str, window: int, confidence: float, seed: int, per_group
     return {
         "det": float(detected.sum() / (onset < 10**6).sum()), "faulty": int((onset < 10**6).sum()),
         "delay": np.percentile(delay, [50, 90]).tolist(),
-        "fa": float(run(build(), simulate(plant, healthy).obs).alarm.any(axis=1).mean()),
+        "fa": float(run(build(), fly(plant, healthy).obs).alarm.any(axis=1).mean()),
     }  # fmt: skip
 
 
@@ -462,7 +463,7 @@ def picture(path: Path) -> None:
     from fdi_gym.plots import flight
 
     plant = load_plant("B747Lateral")
-    record = simulate(plant, [paper().replace(noise_seed=500_000)])
+    record = fly(plant, [paper().replace(noise_seed=500_000)])
     names = {"exponential forgetting": "two_stage_kf_exponential", "no forgetting": "two_stage_kf"}
     said = {label: run(make_diagnoser(name, plant), record.obs) for label, name in names.items()}
     flight(plant, record, said, entries=(1, 3)).savefig(path)

@@ -17,10 +17,11 @@ import tyro
 from baselines.oracles.mekf_clairvoyant import changes
 from baselines.reproduction.tables import pieces
 from fdi_gym.diagnosis import find_diagnoser, make_diagnoser, run
+from baselines.reproduction.numbered import fly
+from fdi_gym.engine import Record
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant, load_plant
 from fdi_gym.plants import cmg_satellite as cmg
-from fdi_gym.simulation import Record, simulate
 
 METHODS = {
     "UKF": "joint_ukf", "CAUKF": "caukf", "GAUKF": "gaukf", "SGAUKF": "sgaukf", "SGAUKF-odd": "sgaukf_odd",
@@ -199,7 +200,7 @@ def run_piece(p: Piece) -> dict[str, Any]:
     if p.method == "oracle":
         low, high = (max(p.level - 0.005, 0.0), p.level + 0.005) if p.variant == "severity" else ALPHA[p.variant]
         tuning = {"alpha_min": low, "alpha_max": high}
-    record = simulate(plant, scenarios)
+    record = fly(plant, scenarios)
     said = watch(plant, scenarios, record, p.method, **tuning)
     outcomes = []
     for i, scenario in enumerate(scenarios):

@@ -9,10 +9,11 @@ import numpy as np
 from baselines.filters.mekf import first_covariance
 from baselines.oracles.cramer_rao_oracle import Q_FLOOR, bound_step, opened
 from baselines.reproduction.cmg_campaign import Piece, scenarios_of, table4_outcome, watch
+from baselines.reproduction.numbered import fly
+from fdi_gym.engine import simulate, white_noise
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
-from fdi_gym.simulation import simulate, white_noise
 
 AFTER = (100, 300, 1000, 3000)  # samples after the onset at which the bound is read
 # other readings of the data sheet's regulation at 75 dB: options of the plant, process noise, tuning of the filter
@@ -32,7 +33,7 @@ def bound_piece(reference: str, snr: int, onset: int, count: int, excitation: st
     scenarios = [
         FaultScenario(plant=cmg.ID, steps=steps, reference={"profile": reference}, noise_seed=900 + i) for i in range(count)
     ]
-    record = simulate(plant, scenarios)
+    record = fly(plant, scenarios)
     x, r, f = record.state, plant.split(record.obs)[1], np.ones((count, 4))
     R = plant.R[:6, :6]
     Q = np.diag([0.0] * 3 + [max(cmg.SIGMA_Q, Q_FLOOR) ** 2] * 3 + [0.0] * 4)
@@ -50,7 +51,7 @@ def tracking_piece(reference: str, every: int = 20) -> dict[str, Any]:
     """Estimates over the source's time line at 45 dB, one sample in `every`."""
     plant = load_plant(cmg.ID, reference=reference, snr=45)
     scenarios = scenarios_of(Piece("table4", reference, 45, "SGAUKF", 0))[:1]
-    record = simulate(plant, scenarios)
+    record = fly(plant, scenarios)
     found: dict[str, Any] = {"truth": record.theta[0, ::every].tolist()}
     for method in ("SGAUKF", "MEKF", "CLAIR"):
         found[method] = watch(plant, scenarios, record, method).estimate[0, ::every].tolist()

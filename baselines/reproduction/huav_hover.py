@@ -25,14 +25,15 @@ from baselines.reproduction.huav_reference import (
     WALK,
     WRONG_FLAGS,
 )
+from baselines.reproduction.numbered import fly
 from baselines.reproduction.tables import markdown, pieces
 from fdi_gym.diagnosis import Diagnoser, filtering, make_diagnoser, run
 from fdi_gym.estimation.belief import fault_inputs
 from fdi_gym.estimation.labels import channel_sets
+from fdi_gym.engine import Record
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant, load_plant
-from fdi_gym.plants.huav_hover import CHANNELS, ID, disturbance_rows, episode, fault_free_episode, paper
-from fdi_gym.simulation import Record, simulate
+from fdi_gym.plants.huav_hover import CHANNELS, ID, disturbance_rows, episode, fault_free_episode, paper, prescribed_noise
 
 DT, MRAD = 0.02, 1e-3
 SETS = {3: CHANNELS[1:], 4: CHANNELS}
@@ -118,7 +119,7 @@ def scenario_piece(
     """One filter on one of the source's scenarios."""
     channels, plant = SETS[p], load_plant(ID, kappa=kappa)
     scenarios = [paper(number).replace(noise_seed=s) for s in NOISE_SEEDS[:seeds]]
-    record = simulate(plant, scenarios)
+    record = fly(plant, scenarios, prescribed_noise)
     w = watch(make_diagnoser(name, plant, channels=channels, **(tuning or {})), plant, channels, record.obs)
     truth = record.target[:, 1:, [CHANNELS.index(c) for c in channels]]
     sets = faulty_steps(scenarios, truth.shape[1], channels)
@@ -147,7 +148,7 @@ def random_piece(kappa: float, name: str, count: int) -> dict[str, Any]:
     """One filter on the randomised process and on fault-free flights."""
     plant = load_plant(ID, kappa=kappa)
     scenarios = [episode(s) for s in range(count)]
-    record = simulate(plant, scenarios)
+    record = fly(plant, scenarios, prescribed_noise)
     w = watch(make_diagnoser(name, plant), plant, CHANNELS, record.obs)
     steps = w.on.shape[1]
     last = np.where(record.terminated, record.length - 1, record.length)  # a step that ends the flight does not count
@@ -167,7 +168,7 @@ def random_piece(kappa: float, name: str, count: int) -> dict[str, Any]:
             wanted = np.arange(4) == CHANNELS.index(fault.mode)
             first_right += bool(some.size and (rows[some[0]] == wanted).all())
     d = np.array([disturbance_rows(s)[:-1] for s in scenarios])
-    quiet = simulate(plant, [fault_free_episode(s) for s in range(6000, 6000 + count)])
+    quiet = fly(plant, [fault_free_episode(s) for s in range(6000, 6000 + count)], prescribed_noise)
     flags = watch(make_diagnoser(name, plant), plant, CHANNELS, quiet.obs).on
     kinds: dict[str, list[int]] = {}
     for (*_, kind), waited_for in zip(faults, waited, strict=True):
@@ -192,7 +193,7 @@ def threshold_piece(p: int, kappa: float, name: str, count: int) -> list[float]:
     """Thresholds [mrad] from the fault-free flights."""
     plant = load_plant(ID, kappa=kappa)
     diagnoser = make_diagnoser(name, plant, channels=SETS[p])
-    obs = simulate(plant, [fault_free_episode(s) for s in range(5000, 5000 + count)]).obs
+    obs = fly(plant, [fault_free_episode(s) for s in range(5000, 5000 + count)]).obs
     most = np.zeros((count, p))
     for _, verdict in filtering.readings(plant, diagnoser, obs):
         most = np.maximum(most, np.asarray(verdict.evidence.channels))
@@ -229,7 +230,7 @@ def oracle_piece(kappa: float, count: int) -> dict[str, Any]:
     """Share of single faults that the matched oracle attributes within a window; "rest": to the end of the flight."""
     plant = load_plant(ID, kappa=kappa)
     scenarios = [s for s in map(episode, range(count)) if len(s.faults) == 1]
-    record = simulate(plant, scenarios)
+    record = fly(plant, scenarios, prescribed_noise)
     diagnoser = make_diagnoser("matched_oracle", plant, scenarios=scenarios)
     n = len(scenarios)
     truth = np.array([CHANNELS.index(s.faults[0].mode) for s in scenarios])
@@ -250,7 +251,7 @@ def figure_piece(number: int) -> dict[str, Any]:
     """Estimates of all five filters over one flight, p3, kappa 0."""
     plant = load_plant(ID, kappa=0.0)
     scenario = paper(number).replace(noise_seed=100)
-    record: Record = simulate(plant, [scenario])
+    record: Record = fly(plant, [scenario], prescribed_noise)
     found: dict[str, Any] = {"true": record.target[0, 1:, 1:].tolist()}
     for name in list(SHORT)[:5]:
         w = watch(make_diagnoser(name, plant, channels=SETS[3]), plant, SETS[3], record.obs)

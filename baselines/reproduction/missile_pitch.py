@@ -5,6 +5,7 @@ their counts must be identical; where random numbers differ, the spread decides.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -29,12 +30,13 @@ from baselines.reproduction.missile_page import (
     robustness_section,
     study_section,
 )
+from baselines.reproduction.numbered import fly
 from baselines.reproduction.tables import markdown, pieces
 from fdi_gym.diagnosis import make_diagnoser, run
+from fdi_gym.engine import simulate
 from fdi_gym.faults import FaultScenario, Incipient, draw
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants import missile_pitch as missile
-from fdi_gym.simulation import simulate
 
 DT = missile.DT
 FIVE = (1, 2, 3, 4, 5)
@@ -146,10 +148,11 @@ def robustness(label: int, noisy: bool, runs: int, corners: bool = False) -> dic
     rng = np.random.default_rng(4711 + 10 * label + noisy)
     rhos = [[0.05 * s for s in signs] for signs in itertools.product((-1, 1), repeat=6)] if corners else \
         rng.uniform(-0.05, 0.05, (runs, 6)).tolist()  # fmt: skip
+    order = functools.partial(missile.bounded_noise, noise_scale=float(noisy))
     base = missile.study(max(label, 1))
     scenarios = [base.replace(physical={"rho": rho}, noise_seed=i, faults=base.faults if label else [])
                  for i, rho in enumerate(rhos)]  # fmt: skip
-    found = adaptive_bank(plant, simulate(plant, scenarios).obs, (1, 2))
+    found = adaptive_bank(plant, fly(plant, scenarios, order).obs, (1, 2))
     onset = 1000 if label else 2001
     result: dict[str, Any] = {"runs": len(rhos), "early": int(found["alarm"][:, :onset].any(axis=1).sum())}
     if label:
@@ -251,7 +254,7 @@ def hard(first_seed: int, runs: int) -> dict[str, Any]:
     """A group of the hard process. Labels as the data sheet has them: sample k has the fault of [k, k + 1)."""
     plant = missile.plant()
     scenarios: list[FaultScenario] = [draw(plant.process("hard"), first_seed + i) for i in range(runs)]
-    flown = simulate(plant, scenarios)
+    flown = fly(plant, scenarios, missile.bounded_noise)
     label = np.concatenate([flown.label[:, 1:], flown.label[:, -1:]], axis=1)
     scored = np.zeros(label.shape, bool)
     scored[:, 200:] = True

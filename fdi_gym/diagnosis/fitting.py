@@ -20,7 +20,7 @@ from fdi_gym.estimation.calibration import Calibration, thresholds_from
 from fdi_gym.estimation.data import rounded
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.plant import Array, Plant
-from fdi_gym.simulation import Record, simulate
+from fdi_gym.engine import Record, simulate
 
 VALIDATION_SEED = 2_000_000
 FLIGHTS = 32  # of a belief

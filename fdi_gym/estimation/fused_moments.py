@@ -20,7 +20,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from fdi_gym.kernels import _advance, _project_at, map_at
+from fdi_gym.integration import interval
+from fdi_gym.kernels import map_at, project_at
 
 EXTENDED, UNSCENTED, CENTRAL_DIFFERENCE = 0, 1, 2
 LOG_2PI = float(np.log(2.0 * np.pi))
@@ -36,7 +37,7 @@ def pass_points(moving, integers, reals, offset, direction, t, points, u, known,
 
     That is the state one sample later, or what the chosen sensors read.
     """
-    dynamics, output, project = map_at(integers[0]), map_at(integers[1]), _project_at(integers[2])
+    dynamics, output, project = map_at(integers[0]), map_at(integers[1]), project_at(integers[2])
     substeps, n_x, n_y, n_theta = integers[3], integers[4], integers[5], integers[6]
     p, n_d, m = integers[8], integers[9], integers[10]
     n_m = direction.shape[1]
@@ -59,8 +60,8 @@ def pass_points(moving, integers, reals, offset, direction, t, points, u, known,
         for j in range(n_x):
             x[j] = points[i, j]
         if moving:
-            _advance(
-                dynamics, project, t, dt, substeps, x, u, theta, still, still, d, physical, theta_now, k1, k2, k3, k4, z
+            interval(
+                dynamics, project, t, dt, substeps, x, u, False, theta, still, still, d, physical, theta_now, k1, k2, k3, k4, z
             )
             for j in range(n_x):
                 values[i, j] = x[j]

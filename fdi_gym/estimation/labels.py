@@ -48,7 +48,7 @@ def nearest_of(I: Array, Iz: Array, sets: Manifolds) -> tuple[Array, Array]:  # 
 
     I (n or 1, p, p) information about the deviation from healthy, Iz (n, p) what it says. Returns (n, h) and m (n, h, f).
     """
-    from fdi_gym import kernels
+    from fdi_gym.estimation import compiled
 
     D, offset = sets.direction, sets.offset
     Io = (I @ offset.T).swapaxes(1, 2)  # (n, h, p)
@@ -57,7 +57,7 @@ def nearest_of(I: Array, Iz: Array, sets: Manifolds) -> tuple[Array, Array]:  # 
     G = np.swapaxes(D, 1, 2) @ I[:, None] @ D  # (n, h, f, f)
     G = G if len(G) == len(g) else np.repeat(G, len(g), axis=0)  # the kernel does not repeat the only row of I
     m, value = np.zeros_like(g), np.empty_like(base)
-    kernels.box_minimum(*(contiguous(a) for a in (G, g, sets.low, sets.high)), m, value)
+    compiled.box_minimum(*(contiguous(a) for a in (G, g, sets.low, sets.high)), m, value)
     return base + value, m
 
 

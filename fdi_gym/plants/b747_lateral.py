@@ -221,15 +221,15 @@ def excitation(reference: Mapping[str, Any], steps: int) -> np.ndarray:
 def reference_rows(scenario: FaultScenario) -> np.ndarray:
     """r_k = (e_aileron, e_rudder, phi_ref): the bank reference is the drawn levels through a 2 s lag."""
     steps = scenario.steps
-    levels = np.array(scenario.reference.get("bank_levels", [0.0]))
-    level = levels[np.minimum(np.arange(steps + 1) // 150, levels.size - 1)]
-    phi_ref = np.zeros(steps + 1)
-    if levels.any():
+    rows = np.zeros((steps + 1, 3))
+    rows[:, :2] = excitation(scenario.reference, steps)
+    levels = scenario.reference.get("bank_levels", [0.0])
+    if any(levels):
         a, s = np.exp(-DT / 2.0), 0.0
         for k in range(steps + 1):
-            s = a * s + (1 - a) * level[k]
-            phi_ref[k] = s
-    return np.column_stack([excitation(scenario.reference, steps), phi_ref])
+            s = a * s + (1 - a) * levels[min(k // 150, len(levels) - 1)]
+            rows[k, 2] = s
+    return rows
 
 
 def gust_rows(scenario: FaultScenario) -> np.ndarray:

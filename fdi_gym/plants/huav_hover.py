@@ -549,6 +549,6 @@ def plant(*, kappa: float = 0.3, K_B: float = 0.84) -> Plant:
         c0=np.concatenate([np.zeros(4), x_trim[9:]]),
         q=np.concatenate([K.ravel(), u_trim, x_trim, [p[5], np.exp(-DT / TAU_F)]]),
         physical=physical, perturb=perturb, shapes=Shapes(Nothing, Gusts, Physical),
-        noise=prescribed_noise, isolation_reward=np.eye(len(labels)) - 0.5 * wrongly,
+        isolation_reward=np.eye(len(labels)) - 0.5 * wrongly,
         identification_reward=identification_reward,
     )  # fmt: skip

@@ -445,6 +445,5 @@ def plant(*, noise_scale: float = 1.0, fault_scale: float = 1.0) -> Plant:
         processes=_processes(fault_scale),
         c0=np.zeros(6), q=prefilter(), physical=physical, perturb=perturb,
         reference=reference_rows, disturbance=disturbance_rows, measured_disturbance=measured_disturbance,
-        shapes=Shapes(Reference, Flow, Physical),
-        noise=lambda rng, steps: bounded_noise(rng, steps, noise_scale), isolation_reward=reward,
+        shapes=Shapes(Reference, Flow, Physical), noise_limit=CLIP, isolation_reward=reward,
     )  # fmt: skip

@@ -1,0 +1,244 @@
+"""The closed loop, sample by sample: THE order of operations in a step is written here and nowhere else.
+
+At sample k: the sensors give y_k; what else is known gives n_k; the controller computes u_k, held until k + 1; entries of
+theta that a hold fault owns take their value; the plant advances to x_{k+1} under the fault parameter that acts over
+[k, k + 1); process noise is added. The observation is [y_k, u_{k-1}, n_k]. u_{-1} is the trim command and theta at sample
+0 the nominal one: no interval has ended before sample 0.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numba import float64, int64, types, uint64, void
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from fdi_gym.integration import interval
+from fdi_gym.kernels import M, V, compiled, control_at, known_at, map_at, outside_at, project_at
+from fdi_gym.noise import fill
+
+TILE = 32  # samples of one flight flown before the next one's turn
+
+# Columns of a flight's table of effects: entry of theta, first and end step, kind, and what the kind needs
+ENTRY, ONSET, END, KIND, VALUE, FIRST, SECOND, COLUMNS = range(8)
+ABRUPT, INCIPIENT, INTERMITTENT, SQUARE, HOLD, SAMPLES = range(6)
+
+# Columns of a sensor's faults at a sample; all 0: none
+GAIN, BIAS, NOISE, FROZEN, LAG, MISSING, FAULTS = range(7)
+
+# Where a flight is
+FLYING, ENDED, OVER, TERMINATED = range(4)  # ENDED: its last sample is still to be shown; TERMINATED: over, before its time
+
+
+@intrinsic
+def _pointer(typing_context, where):
+    """A pointer to float64 from its address."""
+
+    def codegen(context, builder, _, arguments):
+        return builder.inttoptr(arguments[0], cgutils.voidptr_t)
+
+    return types.voidptr(int64), codegen
+
+
+@numba.njit
+def _effects(k, seen, dt, table, count, values, held, nominal, a, b, g):
+    """theta over step k as a + b exp(-g tau), tau after sample k, from the effects that act then; of two, the later listed.
+
+    `seen`: as the sensors meet it at sample k, before the command of step k is known.
+    Returns whether any entry drifts.
+    """
+    for j in range(a.size):
+        a[j], b[j], g[j] = nominal[j], 0.0, 0.0
+    drifts = False
+    for e in range(count):
+        onset = np.int64(table[e, ONSET])
+        if not onset <= k < table[e, END]:
+            continue
+        j, kind, value = np.int64(table[e, ENTRY]), np.int64(table[e, KIND]), table[e, VALUE]
+        since = (k - onset) * dt
+        b[j] = g[j] = 0.0
+        if kind == ABRUPT:
+            a[j] = value
+        elif kind == INCIPIENT:
+            a[j], g[j] = value, table[e, FIRST]
+            b[j] = (nominal[j] - value) * np.exp(-g[j] * since)
+            drifts = True
+        elif kind == INTERMITTENT:
+            a[j] = value if (since / table[e, FIRST] + 1e-9) % 1.0 < table[e, SECOND] else nominal[j]
+        elif kind == SQUARE:
+            half = np.floor(since / (0.5 * table[e, FIRST]) + 1e-9)
+            a[j] = value if half % 2.0 == 0.0 else table[e, SECOND]
+        elif kind == SAMPLES:
+            last = np.int64(table[e, FIRST]) - 1
+            a[j] = numba.carray(_pointer(values[e]), (last + 1,), float64)[min(k - onset, last)]
+        elif seen and k == onset:
+            a[j] = nominal[j]
+        else:
+            a[j] = held[e]
+    return drifts
+
+
+@numba.njit
+def _sense(k, y, z, row, sigma, limit, injected, v, sensors, s, slot, box, history, last, reading, shown):
+    """What the sensors say: `reading` (what the controller gets) and `shown` (NaN where a sensor does not report)."""
+    for i in range(y.size):
+        true = y[i]
+        if history.shape[0]:
+            history[k % history.shape[0], i] = true
+        noise = v[k, i] if injected else sigma[i] * min(max(z[row, i], -limit), limit) if sigma[i] else 0.0
+        missing = frozen = False
+        if sensors.shape[0]:
+            lag = np.int64(sensors[s, slot, i, LAG])
+            if lag:
+                true = history[max(k - lag, 0) % history.shape[0], i]
+            if sensors[s, slot, i, GAIN]:
+                true += sensors[s, slot, i, GAIN] * true
+            if sensors[s, slot, i, BIAS]:
+                true += sensors[s, slot, i, BIAS]
+            if sensors[s, slot, i, NOISE]:
+                noise += sensors[s, slot, i, NOISE] * noise
+            frozen, missing = sensors[s, slot, i, FROZEN] != 0.0, sensors[s, slot, i, MISSING] != 0.0
+        says = min(max(true + noise, box[0, i]), box[1, i])
+        if (frozen or missing) and k:
+            says = last[i]
+        last[i] = reading[i] = says
+        shown[i] = np.nan if missing else says
+
+
+_I, _D3 = int64[::1], float64[:, :, ::1]
+
+
+@compiled(
+    void(
+        int64, int64, int64, int64, int64, int64,
+        float64, int64, int64, V, V, M, M, V, float64, _I,
+        uint64[::1], _I, _I, _I, _I, _I, M, _D3, _I, int64[:, ::1], int64[:, :, ::1],
+        _I, _I, M, M, M, M, M, M, _D3,
+        _I, int64, int64, _D3, float64[:, :, :, ::1], _D3, _D3, _D3, int64[:, ::1],
+    )
+)  # fmt: skip
+def fly(
+    dynamics_address, output_address, control_address, known_address, project_address, outside_address,
+    dt, substeps, true_feedback, nominal, q, sensor_box, command_box, sigma, limit, widths,
+    seed, steps, reference_at, disturbance_at, process_noise, sensor_noise, p, effects, counts, values, labels,
+    at, status, X, C, U, THETA, held, readings, histories,
+    slots, first, samples, inputs, sensors, obs, state, theta, label,
+):  # fmt: skip
+    """Fly the flights in `slots` on by so many samples, into the rows from `first` on of obs, state, theta and label.
+
+    The second line of arguments is the plant's, the third the flights' (one row each; tables by address; a noise address
+    of 0: by counter), the fourth where they are, changed in place. `inputs` (samples, flights, n_u) is added to the command
+    within its range, `sensors` (samples, flights, n_y, FAULTS) is what is wrong with the sensors; either may be empty.
+    """
+    dynamics, output, control = map_at(dynamics_address), map_at(output_address), control_at(control_address)
+    known, project, outside = known_at(known_address), project_at(project_address), outside_at(outside_address)
+    n, n_u, n_c, n_y, n_theta = X.shape[1], U.shape[1], C.shape[1], sensor_box.shape[1], nominal.size
+    n_k = obs.shape[2] - n_y - n_u
+    n_r, n_d = widths[0], widths[1]
+    x, u, c, p_i, acts = np.empty(n), np.empty(n_u), np.empty(n_c), np.empty(p.shape[1]), np.empty(n_theta)
+    y, reading, shown, fed, out = np.empty(n_y), np.empty(n_y), np.empty(n_y), np.empty(n_y), np.empty(n_k)
+    a, b, g, theta_k = np.empty(n_theta), np.empty(n_theta), np.empty(n_theta), np.empty(n_theta)
+    r, d = np.empty(n_r), np.empty(n_d)
+    k1, k2, k3, k4, z, before = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    used, words, normals = sigma > 0.0, np.empty((2, TILE), np.uint64), np.zeros((TILE, sigma.size))
+    steady = not used.any()
+    for tile in range(0, samples, TILE):
+        for slot in slots:
+            if status[slot] >= OVER:
+                continue
+            k, last = at[slot], steps[slot]
+            for i in range(n):
+                x[i] = X[slot, i]
+            for i in range(n_u):
+                u[i] = U[slot, i]
+            for i in range(n_c):
+                c[i] = C[slot, i]
+            for i in range(p_i.size):
+                p_i[i] = p[slot, i]
+            for j in range(n_theta):
+                acts[j] = THETA[slot, j]
+            injected = process_noise[slot] != 0
+            if not (injected or steady):
+                fill(seed[slot], k, min(TILE, samples - tile), used, words, normals)
+            references = numba.carray(_pointer(reference_at[slot]), (last + 1, n_r), float64)
+            disturbances = numba.carray(_pointer(disturbance_at[slot]), (last + 1, n_d), float64)
+            w = numba.carray(_pointer(process_noise[slot]), (last, n), float64)
+            v = numba.carray(_pointer(sensor_noise[slot]), (last + 1, n_y), float64)
+            acting, count, values_i, held_i = effects[slot], counts[slot], values[slot], held[slot]
+            readings_i, history, segment = readings[slot], histories[slot], 0
+            for s in range(tile, min(tile + TILE, samples)):
+                row, t = first + s, k * dt
+                # sample k: what acts, what is measured, what is known
+                for i in range(n_r):
+                    r[i] = references[k, i]
+                for i in range(n_d):
+                    d[i] = disturbances[min(k, last - 1), i]
+                _effects(k, True, dt, acting, count, values_i, held_i, nominal, a, b, g)
+                for j in range(n_theta):
+                    theta_k[j] = a[j] + b[j]
+                output(t, x, u, theta_k, d, p_i, y)
+                for i in range(n_y):
+                    fed[i] = y[i]
+                _sense(
+                    k, y, normals, s - tile, sigma, limit, injected, v, sensors, s, slot, sensor_box, history, readings_i,
+                    reading, shown,
+                )  # fmt: skip
+                if not true_feedback:
+                    for i in range(n_y):
+                        fed[i] = reading[i]
+                known(t, r, c, out)
+                while labels[slot, segment + 1, 0] <= k:
+                    segment += 1
+                label[row, slot] = labels[slot, segment, 1]
+                for i in range(n):
+                    state[row, slot, i] = x[i]
+                for j in range(n_theta):
+                    theta[row, slot, j] = acts[j]
+                for i in range(n_y):
+                    obs[row, slot, i] = shown[i]
+                for i in range(n_u):
+                    obs[row, slot, n_y + i] = u[i]
+                for i in range(n_k):
+                    obs[row, slot, n_y + n_u + i] = out[i]
+                if k == last or status[slot] == ENDED:
+                    status[slot] = TERMINATED if status[slot] == ENDED else OVER
+                    steps[slot] = k
+                    break
+                # step k: the command, the interval to sample k + 1
+                control(t, fed, r, q, c, u)
+                if inputs.shape[0]:
+                    for i in range(n_u):
+                        if inputs[s, slot, i]:
+                            u[i] = min(max(u[i] + inputs[s, slot, i], command_box[0, i]), command_box[1, i])
+                for e in range(count):
+                    if acting[e, KIND] == HOLD and k == acting[e, ONSET] - acting[e, SECOND]:
+                        held_i[e] = u[np.int64(acting[e, FIRST])]
+                drifts = _effects(k, False, dt, acting, count, values_i, held_i, nominal, a, b, g)
+                for i in range(n):
+                    before[i] = x[i]
+                interval(dynamics, project, t, dt, substeps, x, u, drifts, a, b, g, d, p_i, acts, k1, k2, k3, k4, z)
+                lost = False
+                for i in range(n):
+                    if injected:
+                        x[i] += w[k, i]
+                    elif used[n_y + i]:
+                        x[i] += sigma[n_y + i] * min(max(normals[s - tile, n_y + i], -limit), limit)
+                    lost = lost or not np.isfinite(x[i])
+                if lost:  # the state has left the numbers: the last finite one is what is shown
+                    for i in range(n):
+                        x[i] = before[i]
+                k += 1
+                for i in range(n_r):
+                    r[i] = references[k, i]
+                if lost or outside(t + dt, x, r):
+                    status[slot] = ENDED
+            at[slot] = k
+            for i in range(n):
+                X[slot, i] = x[i]
+            for i in range(n_u):
+                U[slot, i] = u[i]
+            for i in range(n_c):
+                C[slot, i] = c[i]
+            for j in range(n_theta):
+                THETA[slot, j] = acts[j]

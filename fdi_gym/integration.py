@@ -1,0 +1,108 @@
+"""One sample interval of any plant, and the model's prediction and output for many points at once."""
+
+import numba
+import numpy as np
+from numba import float64, int64, void
+
+from fdi_gym.kernels import M, V, compiled, map_at, project_at
+
+
+@numba.njit
+def _theta_at(tau, a, b, g, theta):
+    for j in range(theta.size):
+        theta[j] = a[j] if b[j] == 0.0 else a[j] + b[j] * np.exp(-g[j] * tau)
+
+
+@numba.njit
+def interval(dynamics, project, t, dt, substeps, x, u, drifts, a, b, g, d, p, theta, k1, k2, k3, k4, z):
+    """One sample interval: x(t) -> x(t + dt) in place, theta(t + tau) = a + b exp(-g tau), u and d held.
+
+    Classical Runge-Kutta with `substeps` steps; for `substeps` = 0 the plant is discrete and maps x itself. `drifts` says
+    whether any b is not 0.
+    """
+    n = x.size
+    _theta_at(0.0, a, b, g, theta)
+    if substeps == 0:
+        dynamics(t, x, u, theta, d, p, k1)
+        for i in range(n):
+            x[i] = k1[i]
+    else:
+        h = dt / substeps
+        for s in range(substeps):
+            tau = s * h
+            dynamics(t + tau, x, u, theta, d, p, k1)
+            for i in range(n):
+                z[i] = x[i] + 0.5 * h * k1[i]
+            if drifts:
+                _theta_at(tau + 0.5 * h, a, b, g, theta)
+            dynamics(t + tau + 0.5 * h, z, u, theta, d, p, k2)
+            for i in range(n):
+                z[i] = x[i] + 0.5 * h * k2[i]
+            dynamics(t + tau + 0.5 * h, z, u, theta, d, p, k3)
+            for i in range(n):
+                z[i] = x[i] + h * k3[i]
+            if drifts:
+                _theta_at(tau + h, a, b, g, theta)
+            dynamics(t + tau + h, z, u, theta, d, p, k4)
+            for i in range(n):
+                x[i] += h / 6.0 * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i])
+    if drifts:
+        _theta_at(dt, a, b, g, theta)
+    project(x, theta)
+
+
+@compiled(void(int64, int64, float64, int64, V, M, M, M, M, M, M))
+def propagate(dynamics_address, project_address, dt, substeps, t, x, u, theta, d, p, out):
+    """out[i] = the state one sample after x[i]; t, u, theta, d, p have m rows that serve M/m consecutive points each."""
+    dynamics, project = map_at(dynamics_address), project_at(project_address)
+    points, n = x.shape
+    xi, ui, ti, di, pi = (
+        np.empty(n),
+        np.empty(u.shape[1]),
+        np.empty(theta.shape[1]),
+        np.empty(d.shape[1]),
+        np.empty(p.shape[1]),
+    )
+    b, g, work = np.zeros(ti.size), np.zeros(ti.size), np.empty(ti.size)
+    k1, k2, k3, k4, z = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    every_t, every_u, every_theta = points // t.size, points // u.shape[0], points // theta.shape[0]
+    every_d, every_p = points // d.shape[0], points // p.shape[0]
+    for i in range(points):
+        for j in range(n):
+            xi[j] = x[i, j]
+        for j in range(ui.size):
+            ui[j] = u[i // every_u, j]
+        for j in range(ti.size):
+            ti[j] = theta[i // every_theta, j]
+        for j in range(di.size):
+            di[j] = d[i // every_d, j]
+        for j in range(pi.size):
+            pi[j] = p[i // every_p, j]
+        interval(dynamics, project, t[i // every_t], dt, substeps, xi, ui, False, ti, b, g, di, pi, work, k1, k2, k3, k4, z)
+        for j in range(n):
+            out[i, j] = xi[j]
+
+
+@compiled(void(int64, V, M, M, M, M, M, M))
+def evaluate(function_address, t, x, u, theta, d, p, out):
+    """out[i] = function(t, x[i], ...): the sensors' values or the state's rate of change, rows served as in `propagate`."""
+    function = map_at(function_address)
+    points = x.shape[0]
+    xi, ui, ti = np.empty(x.shape[1]), np.empty(u.shape[1]), np.empty(theta.shape[1])
+    di, pi, oi = np.empty(d.shape[1]), np.empty(p.shape[1]), np.empty(out.shape[1])
+    every_t, every_u, every_theta = points // t.size, points // u.shape[0], points // theta.shape[0]
+    every_d, every_p = points // d.shape[0], points // p.shape[0]
+    for i in range(points):
+        for j in range(xi.size):
+            xi[j] = x[i, j]
+        for j in range(ui.size):
+            ui[j] = u[i // every_u, j]
+        for j in range(ti.size):
+            ti[j] = theta[i // every_theta, j]
+        for j in range(di.size):
+            di[j] = d[i // every_d, j]
+        for j in range(pi.size):
+            pi[j] = p[i // every_p, j]
+        function(t[i // every_t], xi, ui, ti, di, pi, oi)
+        for j in range(oi.size):
+            out[i, j] = oi[j]
