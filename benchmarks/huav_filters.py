@@ -17,9 +17,9 @@ import scipy.linalg
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from fdi_gym.diagnosis import make_diagnoser
+from fdi_gym.engine import simulate
 from fdi_gym.plant import load_plant
 from fdi_gym.plants.huav_hover import DT, dynamics, episode
-from fdi_gym.engine import simulate
 
 X0_STD = (*[0.1] * 3, *[0.02] * 6, *[0.005] * 2)  # as in baselines/tuning/HUAVHover.json
 NAMES = ("ascdkf", "three_stage_cdkf", "three_stage_ekf", "robust_three_stage_cdkf", "robust_three_stage_ekf",

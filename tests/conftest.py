@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from fdi_gym.diagnosis import filtering, fitting, knowledge
-from fdi_gym.estimation.decision import Rule, Verdict
 from fdi_gym.engine import simulate
+from fdi_gym.estimation.decision import Rule, Verdict
 from fdi_gym.plant import Plant, load_plant, plant_sources
 
 ROOT = Path(__file__).parent.parent

@@ -10,10 +10,10 @@ from baselines.filters import augmented_kf, friedland_kf, kalman_filter, two_sta
 from baselines.filters.bayes_bank import log_mean_exp
 from baselines.filters.windowed_nis import chi_square_quantile
 from fdi_gym.diagnosis import Diagnosis, NotApplicableError, make_diagnoser, run
+from fdi_gym.engine import simulate
 from fdi_gym.estimation.calibration import Persistence, uniform
 from fdi_gym.estimation.decision import Reading, by_candidate, by_labels
 from fdi_gym.estimation.labels import closest, distances, manifolds
-from fdi_gym.engine import simulate
 from fdi_gym.estimation.linear import linear_model
 from fdi_gym.faults import draw
 from fdi_gym.plants import b747_lateral as b747

@@ -13,6 +13,7 @@ from baselines.filters import augmented_kf, two_stage_kf
 from baselines.filters.augmented_gaussian import gaussian_filter
 from fdi_gym.diagnosis import NotApplicableError, diagnosers, fit, fitting, knowledge, make_diagnoser, run
 from fdi_gym.diagnosis.fitting import VALIDATION_SEED, fit_belief, flights_of, long_run
+from fdi_gym.engine import simulate
 from fdi_gym.estimation.augmented import Interval, augmented
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration, Persistence, gain
@@ -23,7 +24,6 @@ from fdi_gym.estimation.labels import Manifolds, nearest_of
 from fdi_gym.estimation.linear import linear_model
 from fdi_gym.faults import draw
 from fdi_gym.plants import b747_lateral as b747_file
-from fdi_gym.engine import simulate
 
 ALL_PLANTS = [*PLANTS, "DCMotor"]
 SMALL = 5e-3

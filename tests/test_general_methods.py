@@ -17,10 +17,10 @@ from baselines.filters.two_stage_kf import two_stage_filter as papers_two_stage
 from baselines.reproduction.consistency import measure, verdict
 from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.diagnosis.fitting import flights_of
+from fdi_gym.engine import no_noise, simulate
 from fdi_gym.estimation import mixing
 from fdi_gym.estimation.gaussian import jacobian
 from fdi_gym.estimation.linear import linear_model
-from fdi_gym.engine import no_noise, simulate
 from fdi_gym.faults import draw
 
 FLIGHTS = 3

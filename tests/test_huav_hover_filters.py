@@ -10,16 +10,16 @@ from baselines.filters import robust_three_stage, three_stage
 from baselines.filters.hypothesis_bank import transitions
 from baselines.filters.propagation import Propagated, central_difference_propagation, extended_propagation, trim_model
 from baselines.oracles.matched_oracle import steady_filter
+from baselines.reproduction.numbered import fly
 from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, guarded, run
 from fdi_gym.diagnosis.filtering import readings
+from fdi_gym.engine import no_noise, simulate
 from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.belief import Belief, fault_inputs
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_channels
 from fdi_gym.estimation.labels import channel_sets, label_of_channels
 from fdi_gym.estimation.linear import linear_output
-from baselines.reproduction.numbered import fly
-from fdi_gym.engine import no_noise, simulate
 from fdi_gym.faults import FaultProcess, FaultScenario
 from fdi_gym.kernels import kernel
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal, load_plant
@@ -710,7 +710,9 @@ def test_thresholds_are_those_of_the_fault_free_flights(name, channels, kappa):
     process = plant.process("fault-free")
     scenarios = [process.sample(np.random.default_rng([s, 1])).replace(noise_seed=s + 1_000_000) for s in range(5000, 5100)]
     most = np.zeros((100, len(channels)))
-    for _, verdict in readings(plant, build(name, plant, channels=channels), simulate(plant, scenarios).obs):
+    for _, verdict in readings(
+        plant, build(name, plant, channels=channels), fly(plant, scenarios, huav_hover.prescribed_noise).obs
+    ):
         most = np.maximum(most, verdict.evidence.channels)
     shipped = find_diagnoser(name).resolve(plant, channels=channels)["thresholds"]
     assert np.quantile(most, 0.99, axis=0) / MRAD == pytest.approx(np.array(shipped) / MRAD, abs=0.00051)

@@ -15,6 +15,7 @@ import pytest
 from conftest import PLANTS, ROOT, build
 
 import fdi_gym
+from fdi_gym.engine import no_noise, simulate
 from fdi_gym.envs import FDIEnv
 from fdi_gym.faults import (
     MAX_STEPS,
@@ -32,7 +33,6 @@ from fdi_gym.faults import (
 )
 from fdi_gym.plant import Kernels, Label, PlantSource, load_plant, plant_sources
 from fdi_gym.shapes import OPEN
-from fdi_gym.engine import no_noise, simulate
 from fdi_gym.testing import _check_range, check_plant
 
 NAN, INF = math.nan, math.inf

@@ -15,9 +15,9 @@ import numpy as np
 import tyro
 
 from baselines.oracles.mekf_clairvoyant import changes
+from baselines.reproduction.numbered import fly
 from baselines.reproduction.tables import pieces
 from fdi_gym.diagnosis import find_diagnoser, make_diagnoser, run
-from baselines.reproduction.numbered import fly
 from fdi_gym.engine import Record
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant, load_plant

@@ -28,9 +28,9 @@ from baselines.reproduction.huav_reference import (
 from baselines.reproduction.numbered import fly
 from baselines.reproduction.tables import markdown, pieces
 from fdi_gym.diagnosis import Diagnoser, filtering, make_diagnoser, run
+from fdi_gym.engine import Record
 from fdi_gym.estimation.belief import fault_inputs
 from fdi_gym.estimation.labels import channel_sets
-from fdi_gym.engine import Record
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant, load_plant
 from fdi_gym.plants.huav_hover import CHANNELS, ID, disturbance_rows, episode, fault_free_episode, paper, prescribed_noise
@@ -193,7 +193,7 @@ def threshold_piece(p: int, kappa: float, name: str, count: int) -> list[float]:
     """Thresholds [mrad] from the fault-free flights."""
     plant = load_plant(ID, kappa=kappa)
     diagnoser = make_diagnoser(name, plant, channels=SETS[p])
-    obs = fly(plant, [fault_free_episode(s) for s in range(5000, 5000 + count)]).obs
+    obs = fly(plant, [fault_free_episode(s) for s in range(5000, 5000 + count)], prescribed_noise).obs
     most = np.zeros((count, p))
     for _, verdict in filtering.readings(plant, diagnoser, obs):
         most = np.maximum(most, np.asarray(verdict.evidence.channels))

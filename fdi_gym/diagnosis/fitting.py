@@ -15,12 +15,12 @@ import numpy as np
 
 from fdi_gym.diagnosis.filtering import readings
 from fdi_gym.diagnosis.registry import Entry, find_diagnoser
+from fdi_gym.engine import Record, simulate
 from fdi_gym.estimation.belief import Belief, fault_inputs, noisy_sensors
 from fdi_gym.estimation.calibration import Calibration, thresholds_from
 from fdi_gym.estimation.data import rounded
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.plant import Array, Plant
-from fdi_gym.engine import Record, simulate
 
 VALIDATION_SEED = 2_000_000
 FLIGHTS = 32  # of a belief
