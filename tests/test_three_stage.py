@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from fdi_gym.diagnosis.fit import fit_belief, flights_of
+from fdi_gym.diagnosis.fitting import fit_belief, flights_of
 
 from baselines.filters.augmented_gaussian import augmented_ekf
 from baselines.filters.unknown_inputs import known_of
