@@ -313,7 +313,7 @@ BAD_SEEDS = [
     np.bool_(True),
     np.float64(3),
     b"1",
-    object(),
+    ...,
     float("nan"),
     [1.5, 2, 3],
     [True, 1, 2],
