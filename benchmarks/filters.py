@@ -1,6 +1,6 @@
 """Filters beside FilterPy's: `python benchmarks/filters.py` (needs the extra "bench").
 
-The bare Gaussian step (predict and update, `fdi_gym.estimation.fused`) and whole diagnosers, decision included, at 1, 64
+The bare Gaussian step (predict and update, `fdi_gym.estimation.gaussian`) and whole diagnosers, decision included, at 1, 64
 and 512 episodes side by side. References are FilterPy's filters on the same models: the Kalman filter on the 747's
 augmented model, and the unscented filter with the same sigma points over the satellite's compiled plant, with its
 augmented state (15) for the bare step and with the published joint state (14) for the diagnosers. All contestants take
@@ -24,7 +24,7 @@ from filterpy.kalman import KalmanFilter, MerweScaledSigmaPoints, UnscentedKalma
 
 from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.engine import simulate
-from fdi_gym.estimation import fused
+from fdi_gym.estimation import gaussian
 from fdi_gym.estimation.linear import linear_model
 from fdi_gym.faults import draw
 from fdi_gym.plant import Plant, load_plant
@@ -50,7 +50,7 @@ class Filter(NamedTuple):
     """The augmented model of a plant with all of theta estimated, and what its filter believes."""
 
     plant: Plant
-    model: fused.Model
+    model: gaussian.Model
     rule: str
     X0: np.ndarray  # (N,)
     P0: np.ndarray  # (N, N)
@@ -65,7 +65,7 @@ def general(plant: Plant, rule: str, sensors: range, walk: float) -> Filter:
     points = np.concatenate([np.zeros((1, n_x)), np.eye(n_x)])
     y = plant.measure(0.0, points, plant.trim_command)[:, sensors]
     H = np.hstack([(y[1:] - y[0]).T, np.zeros((m, p))])
-    model = fused.bind(plant, scale=scale, entries=range(p), sensors=sensors, H=H)
+    model = gaussian.bind(plant, scale=scale, entries=range(p), sensors=sensors, H=H)
     floor = [(1e-5 * s.scale) ** 2 for s in plant.states]
     Q = np.diag([*np.maximum(np.diag(plant.Q), floor), *[walk**2] * p])
     P0 = np.diag([*(0.01 * scale[:n_x]) ** 2, *[0.01] * p])
@@ -82,8 +82,8 @@ def bare(flt: Filter, obs: np.ndarray) -> np.ndarray:
     for k in range(1, samples):
         y, u, _ = flt.plant.split(obs[:, k])
         y, u = np.ascontiguousarray(y[:, : flt.model.m]), np.ascontiguousarray(u)
-        X, P = fused.predict(flt.model, flt.rule, X, P, t, u, None, Q)
-        X, P, *_ = fused.update(flt.model, flt.rule, X, P, t, u, None, y, seen, R)
+        X, P = gaussian.predict(flt.model, flt.rule, X, P, t, u, None, Q)
+        X, P, *_ = gaussian.update(flt.model, flt.rule, X, P, t, u, None, y, seen, R)
     return X
 
 

@@ -19,7 +19,6 @@ from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.diagnosis.fitting import flights_of
 from fdi_gym.engine import no_noise, simulate
 from fdi_gym.estimation import mixing
-from fdi_gym.estimation.gaussian import jacobian
 from fdi_gym.estimation.linear import linear_model
 from fdi_gym.faults import draw
 
@@ -54,7 +53,7 @@ def test_two_stage_equals_the_papers_on_the_linear_plant(b747):
     """Same prior and random walk: the Keller-Darouach recursion of the 747 to rounding."""
     record = flights_of(b747, "standard", 400_000, FLIGHTS, True)[1]
     model = model_of(b747, x0_std=[0.1] * 4, z0_std=[1, 1, 2, 2], z_walk=[1e-3] * 4)
-    model = model._replace(limit=np.full(8, np.inf))
+    model = model.replace(limit=np.full(8, np.inf))
     own = papers_two_stage(b747, aging(b747, 1e-6, "none", 0.99, 1e-4, 1.0))
     obs = record.obs[:, :400]
     for a, b in zip(readings(b747, two_stage_filter(model, first_sample=False), obs), readings(b747, own, obs), strict=True):
@@ -164,7 +163,7 @@ def test_linearisation_equals_the_jacobian_where_the_model_is_linear_in_the_faul
         return model.f(points, at)
 
     found = glr.linearised(model, f, X, *glr.secants(b747, belief_of(b747).z_size), model.rest)
-    _, F = jacobian(f, np.concatenate([X, np.zeros((2, 4))], axis=1), model.step)
+    _, F = model.jacobian_f(np.concatenate([X, np.zeros((2, 4))], axis=1), at)
     assert np.allclose(found.A, F[:, :4, :4], atol=1e-9)
     assert np.allclose(found.E, F[:, :4, 4:], atol=1e-9)
 

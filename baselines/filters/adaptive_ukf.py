@@ -20,7 +20,6 @@ from fdi_gym.estimation.augmented import AugmentedModel, Interval, augmented
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import by_labels
-from fdi_gym.estimation.gaussian import unscented
 from fdi_gym.estimation.kalman import quadratic
 from fdi_gym.plant import Array, Plant
 
@@ -93,10 +92,10 @@ def adaptive_filter(model: AugmentedModel, size: Array, grid: str) -> Filter:
             def run(rows: Array, P_c: Array) -> Trial:
                 i = up[rows]
                 here = at.of(i)
-                X, P = model.predict(unscented, s.before.X[i], P_c, here)
-                done = model.update(unscented, X, P, here, y[i], seen[i])
-                residual = np.where(ours[i], y[i][:, model.sensors] - model.h(done.x[:, None], here)[:, 0], 0.0)
-                return Trial(done.x, done.P, residual**2 @ r_inv, P_c)
+                X, P = model.predict("unscented", s.before.X[i], P_c, here)
+                done = model.update("unscented", X, P, here, y[i], seen[i])
+                residual = np.where(ours[i], y[i][:, model.sensors] - model.h(done.X[:, None], here)[:, 0], 0.0)
+                return Trial(done.X, done.P, residual**2 @ r_inv, P_c)
 
             kept = search(s.before.P[up], s.adapted[up], run)
             X, P = after.X.copy(), after.P.copy()

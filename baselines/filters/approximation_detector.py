@@ -27,7 +27,8 @@ from baselines.filters.missile_model import RANGE, Known
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.calibration import Persistence
-from fdi_gym.estimation.decision import Declared, Reading, Rule, Verdict, declare, undeclared
+from fdi_gym.estimation.automaton import Automaton
+from fdi_gym.estimation.decision import Reading, Rule, Verdict, declare, undeclared
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.missile_pitch import DEG, DT
 
@@ -201,7 +202,7 @@ def exceeded() -> Rule:
     """An alarm for good once a residual exceeds its threshold; no isolation."""
     latched = Persistence(1, 1, 1)
 
-    def step(s: Declared, k: Array, r: Reading, informed: Array) -> tuple[Declared, Verdict]:
+    def step(s: Automaton, k: Array, r: Reading, informed: Array) -> tuple[Automaton, Verdict]:
         assert r.signals is not None
         over = np.any(np.abs(r.signals["residual"]) > r.signals["threshold"], axis=1)
         s = declare(s, np.ones(len(k), np.int64), over, np.zeros(len(k), bool), latched, informed)

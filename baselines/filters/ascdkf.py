@@ -28,7 +28,8 @@ def augmented_model(plant: Plant, known: Known) -> AugmentedModel:
     N = n_x + p + q
     estimated = [plant.estimated[i] for i in inputs.estimated]
     return AugmentedModel(
-        plant, inputs, known.sensors, np.arange(q), slice(0, n_x), slice(n_x, n_x + p), slice(n_x + p, N),
+        plant=plant, inputs=inputs, sensors=known.sensors, disturbances=np.arange(q), x=slice(0, n_x),
+        z=slice(n_x, n_x + p), d=slice(n_x + p, N),
         scale=np.array([s.scale for s in (*plant.states, *estimated, *plant.disturbances)]),
         X0=np.concatenate([known.x0, np.zeros(p + q)]),
         P0=np.asarray(scipy.linalg.block_diag(known.P0, known.P0b, known.P0d)),

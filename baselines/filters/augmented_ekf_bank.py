@@ -17,7 +17,8 @@ from baselines.filters.missile_ekf import Filters
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.calibration import Persistence
-from fdi_gym.estimation.decision import Declared, Evidence, Reading, Rule, Verdict, declare, undeclared
+from fdi_gym.estimation.automaton import Automaton
+from fdi_gym.estimation.decision import Evidence, Reading, Rule, Verdict, declare, undeclared
 from fdi_gym.plant import Array, Plant
 
 
@@ -35,7 +36,7 @@ def likelihood_ratios(threshold: float, release: float | None, after: Persistenc
     """
     floor = -np.inf if release is None else release
 
-    def step(s: Declared, k: Array, r: Reading, informed: Array) -> tuple[Declared, Verdict]:
+    def step(s: Automaton, k: Array, r: Reading, informed: Array) -> tuple[Automaton, Verdict]:
         assert r.cost is not None
         ratios = 0.5 * (r.cost[:, :1] - r.cost[:, 1:])
         largest = ratios.max(axis=1)

@@ -46,7 +46,6 @@ def gaussian_filter(model: AugmentedModel, rule: str, first_sample: bool = True)
     """
     if rule not in RULES:
         raise ValueError(f"unknown rule {rule!r}; there are {', '.join(RULES)}")
-    passes = RULES[rule]
 
     def start(n: int) -> Gaussian:
         m = len(model.R)
@@ -56,12 +55,12 @@ def gaussian_filter(model: AugmentedModel, rule: str, first_sample: bool = True)
         )  # fmt: skip
 
     def predict(s: Gaussian, at: Interval) -> Gaussian:
-        X, P = model.predict(passes, s.X, s.P, at)
+        X, P = model.predict(rule, s.X, s.P, at)
         return s._replace(X=X, P=P)
 
     def update(s: Gaussian, at: Interval, y: Array, seen: Array) -> Gaussian:
-        c = model.update(passes, s.X, s.P, at, y, seen)
-        return Gaussian(c.x, c.P, c.nu, c.S, seen[:, model.sensors].sum(axis=1))
+        c = model.update(rule, s.X, s.P, at, y, seen)
+        return Gaussian(c.X, c.P, c.nu, c.S, seen[:, model.sensors].sum(axis=1))
 
     return Filter(
         start, predict, update, lambda s: reading_of(model, s), first_sample,

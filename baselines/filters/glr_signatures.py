@@ -70,7 +70,7 @@ def linearised(
     N = len(rest)
     points = np.zeros((n, 1 + 2 * N + 2 * p, len(model.scale)))
     points[:, :, rest] = X[:, None]
-    step = model.step[rest]
+    step = model.compiled.step[rest]
     for j, i in enumerate(rest):
         points[:, 1 + j, i] += step[j]
         points[:, 1 + N + j, i] -= step[j]

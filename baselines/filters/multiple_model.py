@@ -20,8 +20,6 @@ from fdi_gym.estimation.augmented import AugmentedModel, Interval, augmented
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_labels
-from fdi_gym.estimation.gaussian import extended
-from fdi_gym.estimation.kalman import log_likelihood
 from fdi_gym.plant import Array, Plant
 
 SMALLEST_MAGNITUDE, SLOWEST_WALK = 0.05, 1e-3  # standard deviations, in units of the mode's root mean square
@@ -75,7 +73,7 @@ def hypotheses(plant: Plant, belief: Belief) -> Hypotheses:
     if base.H is not None and not base.H[:, base.z].any():
         H = np.zeros((len(base.R), N))
         H[:, keep] = base.H[:, rest]
-    model = base._replace(z=z, d=d, scale=scale, X0=X0, P0=P0, Q=Q, limit=limit, H=H, lines=(offset, direction))
+    model = base.replace(z=z, d=d, scale=scale, X0=X0, P0=P0, Q=Q, limit=limit, H=H, lines=(offset, direction))
     return Hypotheses(model, m0, M0, np.full((labels, labels), change) + (1 - change * labels) * np.eye(labels))
 
 
@@ -102,22 +100,18 @@ def bank(b: Hypotheses) -> Filter:
         mu[:, 0] = 1.0
         return Models(X, P, mu, mu)
 
-    def each(n: int) -> Array:
-        return np.repeat(np.arange(n), labels)
-
     def predict(s: Models, at: Interval) -> Models:
         n = len(s.mu)
         c, w = mixing.ahead(s.mu, b.transition)
         X, P = mixing.mix(w, s.X, s.P, z, b.m0, b.M0)
-        X, P = model.predict(extended, X.reshape(-1, N), P.reshape(-1, N, N), at.of(each(n)), np.tile(model.Q, (n, 1, 1)))
+        X, P = model.predict("extended", X.reshape(-1, N), P.reshape(-1, N, N), at)
         return Models(X.reshape(n, labels, N), P.reshape(n, labels, N, N), s.mu, c)
 
     def update(s: Models, at: Interval, y: Array, seen: Array) -> Models:
         n = len(s.mu)
-        rows = each(n)
-        done = model.update(extended, s.X.reshape(-1, N), s.P.reshape(-1, N, N), at.of(rows), y[rows], seen[rows])
-        mu = mixing.weigh(s.c, log_likelihood(done.nu, done.S).reshape(n, labels), LEAST)
-        return Models(done.x.reshape(n, labels, N), done.P.reshape(n, labels, N, N), mu, mu)
+        done = model.update("extended", s.X.reshape(-1, N), s.P.reshape(-1, N, N), at, y, seen)
+        mu = mixing.weigh(s.c, done.log_likelihood.reshape(n, labels), LEAST)
+        return Models(done.X.reshape(n, labels, N), done.P.reshape(n, labels, N, N), mu, mu)
 
     def state(s: Models) -> Array:
         mu = s.mu / s.mu.sum(axis=1, keepdims=True)

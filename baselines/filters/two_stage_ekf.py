@@ -19,7 +19,6 @@ from fdi_gym.estimation.augmented import AugmentedModel, Interval, augmented, pl
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_labels
-from fdi_gym.estimation.gaussian import jacobian
 from fdi_gym.estimation.kalman import T, masked, right_divide, symmetric, times
 from fdi_gym.plant import Array, Plant
 
@@ -63,7 +62,7 @@ def two_stage_filter(model: AugmentedModel, first_sample: bool = True) -> Filter
         return X
 
     def predict(s: TwoStage, at: Interval) -> TwoStage:
-        X, F = jacobian(lambda points: model.f(points, at), full(s), model.step)
+        X, F = model.jacobian_f(full(s), at)
         A, E = F[:, rest][:, :, rest], F[:, rest][:, :, zs]
         U = A @ s.V + E
         UPz = U @ s.Pz
@@ -78,7 +77,7 @@ def two_stage_filter(model: AugmentedModel, first_sample: bool = True) -> Filter
 
     def update(s: TwoStage, at: Interval, y: Array, seen: Array) -> TwoStage:
         seen = seen[:, model.sensors]
-        mean, J = jacobian(lambda points: model.h(points, at), full(s), model.step)
+        mean, J = model.jacobian_h(full(s), at)
         H = J[:, :, rest]
         Hz = H @ s.V + J[:, :, zs]
         cross = s.Px @ T(H)

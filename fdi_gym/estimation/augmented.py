@@ -6,15 +6,18 @@ model is the plant's compiled one, so whatever is a plant can be filtered.
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
 
+from fdi_gym.estimation import gaussian
 from fdi_gym.estimation.belief import Belief, FaultInputs, fault_inputs
-from fdi_gym.estimation.gaussian import Rule
-from fdi_gym.estimation.kalman import Corrected, T, correct, symmetric, times
+from fdi_gym.estimation.kalman import T
 from fdi_gym.plant import Array, Plant
 
 HELD = 10  # samples within which a command that is held goes wrong by its typical size
@@ -73,7 +76,8 @@ def held_command_covariance(plant: Plant, x: Array, at: Interval) -> Array | Non
     return T(B) @ B
 
 
-class AugmentedModel(NamedTuple):
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AugmentedModel:
     """The model of [x; z; d] and what is believed of it at first."""
 
     plant: Plant
@@ -86,82 +90,68 @@ class AugmentedModel(NamedTuple):
     scale: Array  # (N,) typical size of each entry
     X0: Array  # (N,)
     P0: Array  # (N, N)
-    Q: Array  # (N, N)
+    Q: Array  # (N, N), or one for each line
     R: Array  # (m, m)
     limit: Array  # (N,) largest variance that a walk may reach
-    H: Array | None  # (m, N) where the sensors are linear in X and see nothing else
+    H: Array | None = None  # (m, N) where the sensors are linear in X and see nothing else
     lines: tuple[Array, Array] | None = None  # offsets (r, p) and directions (r, p, f): z are then magnitudes along them
 
-    @property
-    def step(self) -> Array:
-        """Steps of the central differences (N,)."""
-        return STEP * self.scale
+    def replace(self, **changes: Any) -> AugmentedModel:
+        """A copy with some fields changed."""
+        return dataclasses.replace(self, **changes)
 
     @property
     def rest(self) -> list[int]:
         """The entries of X that are not the fault vector."""
         return [*range(self.x.start, self.x.stop), *range(self.d.start, self.d.stop)]
 
-    def deviation(self, z: Array) -> Array:
-        """The fault vector's deviation from healthy (n, ..., p) that z (n, ..., f) stands for; row i lies on line i % r."""
-        if self.lines is None:
-            return z
-        offset, direction = self.lines
-        grouped = z.reshape(-1, len(offset), int(np.prod(z.shape[1:-1])), z.shape[-1])
-        return (offset[:, None] + grouped @ T(direction)).reshape(*z.shape[:-1], offset.shape[-1])
-
-    def _inputs(self, X: Array, known: Array | None) -> tuple[Array, Array]:
-        """theta and d of points X (..., N)."""
-        theta = np.empty((*X.shape[:-1], len(self.plant.theta)))
-        theta[...] = self.plant.nominal_theta
-        theta[..., self.inputs.entries] += self.deviation(X[..., self.z])
-        d = np.zeros((*X.shape[:-1], len(self.plant.disturbances)))
-        if known is not None:
-            d += known.reshape(len(known), *[1] * (X.ndim - 2), -1)
-        d[..., self.disturbances] = X[..., self.d]
-        return theta, d
+    @functools.cached_property
+    def compiled(self) -> gaussian.Model:
+        """The model as the compiled steps take it."""
+        return gaussian.bind(
+            self.plant, scale=self.scale, entries=self.inputs.entries, disturbances=self.disturbances, sensors=self.sensors,
+            limit=self.limit, lines=self.lines, H=self.H,
+        )  # fmt: skip
 
     def f(self, X: Array, at: Interval) -> Array:
         """The points X (n, M, N) one sample later, without noise."""
-        theta, d = self._inputs(X, at.d)
-        moved = X.copy()
-        moved[..., self.x] = self.plant.propagate((at.k - 1) * self.plant.dt, X[..., self.x], at.u, theta, d)
-        return moved
+        return gaussian.f(self.compiled, X, (at.k - 1) * self.plant.dt, at.u, at.d)
 
     def h(self, X: Array, at: Interval) -> Array:
         """What the sensors read at the points X (n, M, N): (n, M, m)."""
-        if self.H is not None:
-            return X @ self.H.T
-        theta, d = self._inputs(X, at.d)
-        y = self.plant.measure(at.k * self.plant.dt, X[..., self.x], at.u, theta, d)
-        return y[..., self.sensors]
+        return gaussian.h(self.compiled, X, at.k * self.plant.dt, at.u, at.d)
+
+    def jacobian_f(self, X: Array, at: Interval) -> tuple[Array, Array]:
+        """X (n, N) one sample later, and the Jacobian of that (n, N, N)."""
+        return gaussian.jacobian_f(self.compiled, X, (at.k - 1) * self.plant.dt, at.u, at.d)
+
+    def jacobian_h(self, X: Array, at: Interval) -> tuple[Array, Array]:
+        """What the sensors read at X (n, N): (n, m), and its Jacobian (n, m, N)."""
+        return gaussian.jacobian_h(self.compiled, X, at.k * self.plant.dt, at.u, at.d)
 
     def expect(self, x: Array, at: Interval) -> Array:
         """What all sensors of the healthy plant read in the states x (n, n_x): (n, n_y)."""
         return self.plant.measure(at.k * self.plant.dt, x, at.u, None, at.d)
 
-    def limited(self, P: Array) -> Array:
-        """P (n, N, N) with the variances of z back at their limit, correlations kept."""
-        variance = np.einsum("nii->ni", P)
-        if (variance <= self.limit).all():
-            return P
-        s = np.sqrt(np.minimum(1.0, self.limit / np.maximum(variance, 1e-300)))
-        return s[:, :, None] * P * s[:, None, :]
+    def predict(self, rule: str, X: Array, P: Array, at: Interval) -> tuple[Array, Array]:
+        """Mean (n, N) and covariance (n, N, N) one sample later; rule is one of `gaussian.RULES`.
 
-    def predict(self, rule: Rule, X: Array, P: Array, at: Interval, Q: Array | None = None) -> tuple[Array, Array]:
-        """Mean and covariance one sample later."""
-        moved = rule(lambda points: self.f(points, at), X, P, self.step)
-        after = symmetric(moved.P) + (self.Q if Q is None else Q)
-        return moved.mean, self.limited(plus_held_commands(self.plant, after, X[:, self.x], at))
+        The interval and the measurement may have fewer rows than X, each for equally many consecutive ones.
+        """
+        after, P = gaussian.predict(
+            self.compiled, rule, X, P, (at.k - 1) * self.plant.dt, at.u, at.d, self.Q if self.Q.ndim == 3 else self.Q[None]
+        )
+        if at.stale is None:
+            return after, P
+        at = at.of(np.repeat(np.arange(len(at.k)), len(X) // len(at.k)))
+        return after, plus_held_commands(self.plant, P, X[:, self.x], at)
 
-    def update(self, rule: Rule, X: Array, P: Array, at: Interval, y: Array, seen: Array) -> Corrected:
+    def update(self, rule: str, X: Array, P: Array, at: Interval, y: Array, seen: Array) -> gaussian.Updated:
         """Update with the measurement y (n, n_y) of the sensors that reported, seen (n, n_y)."""
-        y, seen = y[:, self.sensors], seen[:, self.sensors]
-        if self.H is not None:
-            cross = P @ self.H.T
-            return correct(X, P, y - times(self.H, X), cross, self.H @ cross + self.R, seen)
-        moved = rule(lambda points: self.h(points, at), X, P, self.step)
-        return correct(X, P, y - moved.mean, moved.cross, moved.P + self.R, seen)
+        return gaussian.update(
+            self.compiled, rule, X, P, at.k * self.plant.dt, at.u, at.d, y[:, self.sensors], seen[:, self.sensors],
+            self.R[None],
+        )  # fmt: skip
 
 
 def _linear_sensors(model: AugmentedModel) -> Array | None:
@@ -177,7 +167,7 @@ def _linear_sensors(model: AugmentedModel) -> Array | None:
 
     points = np.concatenate([np.zeros((1, N)), np.diag(model.scale)])
     values = model.h(points[None], at(1))[0]
-    H = T((values[1:] - values[0]) / model.scale[:, None])
+    H = np.ascontiguousarray(T((values[1:] - values[0]) / model.scale[:, None]))
     X = model.scale * rng.standard_normal((16, 1, N))
     found = model.h(X, at(16))
     tolerance = 1e-9 * np.abs(found).max()
@@ -233,6 +223,7 @@ def augmented(
     limit[z] = np.maximum(WIDEST * belief.z_size[:n_z], z0) ** 2
     X0 = np.concatenate([belief.x0, np.zeros(n_z + n_d)])
     model = AugmentedModel(
-        plant, inputs, belief.sensors, belief.disturbances, x, z, d, scale, X0, P0, Q, belief.R, limit, None
-    )
-    return model._replace(H=_linear_sensors(model))
+        plant=plant, inputs=inputs, sensors=belief.sensors, disturbances=belief.disturbances, x=x, z=z, d=d, scale=scale,
+        X0=X0, P0=P0, Q=Q, R=belief.R, limit=limit,
+    )  # fmt: skip
+    return model.replace(H=_linear_sensors(model))

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fdi_gym.estimation.automaton import Automaton, first, step
 from fdi_gym.estimation.belief import FaultInputs
 from fdi_gym.estimation.calibration import LEAST, Calibration, Persistence, gain
 from fdi_gym.estimation.kalman import quadratic
@@ -75,22 +76,12 @@ class Rule(NamedTuple):
 # The automaton
 
 
-class Declared(NamedTuple):
-    """The declared value, and for how many samples each condition has held; all of one shape."""
-
-    label: Array
-    over: Array
-    other: Array
-    under: Array
-    best: Array  # of the last sample
-
-
-def undeclared(shape: int | tuple[int, ...]) -> Declared:
+def undeclared(shape: int | tuple[int, ...]) -> Automaton:
     """Nothing is declared."""
-    return Declared(*(np.zeros(shape, np.int64) for _ in Declared._fields))
+    return first(*np.atleast_1d(shape))
 
 
-def declare(s: Declared, best: Array, over: Array, under: Array, after: Persistence, informed: Array) -> Declared:
+def declare(s: Automaton, best: Array, over: Array, under: Array, after: Persistence, informed: Array) -> Automaton:
     """The declared value after a sample.
 
     Args:
@@ -101,22 +92,10 @@ def declare(s: Declared, best: Array, over: Array, under: Array, after: Persiste
         after: How many samples in a row that takes. A release wins over a switch.
         informed: Where the sample says anything; elsewhere nothing changes.
     """
-    on = s.label > 0
-    before = np.where(after.same & (best != s.best), 0, 1)
-    n_over = np.where(over & ~on, before * s.over + 1, 0)
-    n_other = np.where((best != s.label) & on, before * s.other + 1, 0)
-    n_under = np.where(under & on, s.under + 1, 0)
-    raised, switched, released = n_over >= after.rise, n_other >= after.switch, n_under >= after.release
-    found = Declared(
-        np.where(released, 0, np.where(raised | switched, best, s.label)),
-        np.where(raised, 0, n_over),
-        np.where(switched | released, 0, n_other),
-        np.where(released, 0, n_under),
-        best,
-    )
+    found = step(s, best, over, under, rise=after.rise, switch=after.switch, release=after.release, same=after.same)
     if informed.all():
         return found
-    return Declared(*(np.where(informed, new, old) for new, old in zip(found, s, strict=True)))
+    return Automaton(*(np.where(informed, new, old) for new, old in zip(found, s, strict=True)))
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -262,7 +241,7 @@ def by_candidate(candidate: Callable[[Reading, Array], Array], after: int, warmu
     """
     persistence = Persistence(after, after, after, warmup, same=True)
 
-    def step(s: Declared, k: Array, r: Reading, informed: Array) -> tuple[Declared, Verdict]:
+    def step(s: Automaton, k: Array, r: Reading, informed: Array) -> tuple[Automaton, Verdict]:
         now = candidate(r, s.label)
         s = declare(s, now, now > 0, np.zeros(len(now), bool), persistence, informed & (k > warmup))
         return s, Verdict(s.label > 0, s.label)

@@ -1,76 +1,195 @@
-"""How a Gaussian passes through a function, and the Kalman filter that is made of it.
+"""The Gaussian step in one compiled call: predict, update and their parts, for a batch of episodes and any plant.
 
-Three rules, extended, unscented and central-difference: mean of g(X), covariance of g(X), covariance of X with g(X). The
-rest is the Kalman filter: predict through f and add Q, measure through h and add R, correct. On a linear plant the three
-give the Kalman filter's numbers.
+The model is the augmented one, X = [x; m; d]: the plant's state, magnitudes of its faults and disturbances that nothing
+measures. theta is nominal but for theta[entries], to which offset + direction m is added: an ordinary filter has the one
+line "offset 0, direction I", a bank one line for each of its models, and row i of a stack lies on line i % lines. f moves
+x by one sample (theta, d and the command held) and leaves m and d; h gives the chosen sensors. A Gaussian passes through
+f and h by one of three rules:
 
-A. H. Jazwinski, Stochastic Processes and Filtering Theory, 1970 (extended); S. J. Julier, J. K. Uhlmann, Proceedings of
-the IEEE 92(3), 2004 (unscented); M. Norgaard, N. K. Poulsen, O. Ravn, Automatica 36(11), 2000 (central differences).
+    "extended"            A. H. Jazwinski, Stochastic Processes and Filtering Theory, 1970; Jacobians by differences
+    "unscented"           S. J. Julier, J. K. Uhlmann, Proceedings of the IEEE 92(3), 2004; lambda = 2, equal weights
+    "central difference"  M. Norgaard, N. K. Poulsen, O. Ravn, Automatica 36(11), 2000; interval sqrt(3)
+
+On a linear plant each is the Kalman filter. A sensor that did not report leaves no trace: the result is that of the
+filter without its row, whatever stands in y there. An episode's numbers do not depend on its neighbours, to the bit.
+
+Arrays are stacks with the episodes first. t (n,), u (n, n_u), d (n, n_D), y and seen (n, m) may have fewer rows, each of
+which then serves equally many consecutive episodes; Q and R may have fewer, which serve the episodes in turn (line by
+line). d is what is known of all the plant's disturbances, None where nothing is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi_gym.estimation.kalman import T
-from fdi_gym.estimation.sigma_points import (
-    INTERVAL,
-    central_difference_moments,
-    cholesky,
-    covariance,
-    mean_and_deviations,
-    spread,
-    unscented_points,
-    weights,
-)
+from fdi_gym.estimation import gaussian_kernels as kernels
+from fdi_gym.estimation.gaussian_model import Model, bind
+from fdi_gym.estimation.gaussian_moments import CENTRAL_DIFFERENCE, EXTENDED, UNSCENTED
 from fdi_gym.plant import Array
 
-Function = Callable[[Array], Array]  # points (n, M, N) to their images (n, M, m)
+__all__ = [
+    "RULES", "Corrected", "Model", "Updated", "bind", "correct", "f", "h", "jacobian_f", "jacobian_h", "predict", "update",
+]  # fmt: skip
+
+RULES = {"extended": EXTENDED, "unscented": UNSCENTED, "central difference": CENTRAL_DIFFERENCE}
 
 
-class Passed(NamedTuple):
-    """A Gaussian that has passed through a function."""
+class Updated(NamedTuple):
+    """Outcome of an update. What was not seen has nu = 0 and the identity's row and column in S."""
 
-    mean: Array  # (n, m)
-    P: Array  # (n, m, m)
-    cross: Array  # (n, N, m) with what went in
-
-
-Rule = Callable[[Function, Array, Array, Array], Passed]  # (g, X (n, N), P (n, N, N), step (N,) of differences)
-
-
-def jacobian(g: Function, X: Array, step: Array) -> tuple[Array, Array]:
-    """g at X (n, N), and its Jacobian (n, m, N) by central differences with a step (N,) per entry."""
-    N = X.shape[1]
-    points = np.repeat(X[:, None], 2 * N + 1, axis=1)
-    points[:, 1 : N + 1] += np.diag(step)
-    points[:, N + 1 :] -= np.diag(step)
-    F = g(points)
-    return F[:, 0], T((F[:, 1 : N + 1] - F[:, N + 1 :]) / (2 * step[:, None]))
+    X: Array  # (n, N)
+    P: Array  # (n, N, N)
+    nu: Array  # (n, m) innovation
+    S: Array  # (n, m, m) its covariance
+    nis: Array  # (n,) nu' S^-1 nu, chi-square with as many degrees of freedom as sensors were seen
+    log_likelihood: Array  # (n,) log density of what was seen, its 2 pi terms included; 0 where nothing was
 
 
-def extended(g: Function, X: Array, P: Array, step: Array) -> Passed:
-    """The mean goes through the function, the spread through its Jacobian."""
-    mean, J = jacobian(g, X, step)
-    cross = P @ T(J)
-    return Passed(mean, J @ cross, cross)
+class Corrected(NamedTuple):
+    """Outcome of a correction: as `Updated`, with the gain."""
+
+    X: Array  # (n, N)
+    P: Array  # (n, N, N)
+    nu: Array  # (n, m)
+    S: Array  # (n, m, m)
+    nis: Array  # (n,)
+    log_likelihood: Array  # (n,)
+    K: Array  # (n, N, m), 0 for what was not seen
 
 
-def unscented(g: Function, X: Array, P: Array, step: Array) -> Passed:
-    """2 N + 1 sigma points, lambda = 2, the same weights for mean and covariance."""
-    points, w = unscented_points(X, P), weights(X.shape[1])
-    mean, out = mean_and_deviations(g(points), w)
-    return Passed(mean, covariance(out, out, w), covariance(points - X[:, None], out, w))
+def _rule(name: str) -> int:
+    if name not in RULES:
+        raise ValueError(f"unknown rule {name!r}; there are {', '.join(RULES)}")
+    return RULES[name]
 
 
-def central_difference(g: Function, X: Array, P: Array, step: Array) -> Passed:
-    """Second-order Stirling interpolation with the interval sqrt(3)."""
-    S = cholesky(P)
-    mean, spread_of, D1 = central_difference_moments(g(spread(X, S, INTERVAL)), INTERVAL)
-    return Passed(mean, spread_of, S @ T(D1))
+def _call(kernel: Any, head: tuple[Any, ...], *arrays: Any) -> None:
+    """Call a kernel with the arrays in the order and type that it takes; a copy only of what is not so, or read-only."""
+    plain = [np.ascontiguousarray(a, float) for a in arrays]
+    try:
+        kernel(*head, *plain)
+    except TypeError:
+        plain = [a if a.flags.writeable else a.copy() for a in plain]
+        head = tuple(a.copy() if isinstance(a, np.ndarray) and not a.flags.writeable else a for a in head)
+        try:
+            kernel(*head, *plain)
+        except TypeError:
+            shapes = ", ".join(str(a.shape) for a in plain)
+            raise TypeError(f"the arrays need the documented dimensions, not {shapes}, and `seen` bool") from None
 
 
-RULES: dict[str, Rule] = {"extended": extended, "unscented": unscented, "central difference": central_difference}
+def f(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> Array:
+    """The points X (n, points, N) one sample after t (n,) [s], without noise: (n, points, N)."""
+    moved = np.empty(X.shape)
+    _call(kernels.images, (True, *model.constants), X, t, u, model.unmeasured if d is None else d, moved)
+    return moved
+
+
+def h(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> Array:
+    """What the sensors read at the points X (n, points, N) at t (n,) [s], without noise: (n, points, m)."""
+    y = np.empty((*X.shape[:2], model.m))
+    _call(kernels.images, (False, *model.constants), X, t, u, model.unmeasured if d is None else d, y)
+    return y
+
+
+def jacobian_f(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> tuple[Array, Array]:
+    """X (n, N) one sample after t (n,) [s], and the Jacobian of that (n, N, N) by central differences."""
+    return _differences(model, f(model, _along_axes(model, X), t, u, d))
+
+
+def jacobian_h(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> tuple[Array, Array]:
+    """What the sensors read at X (n, N) at t (n,) [s]: (n, m), and its Jacobian (n, m, N) by central differences."""
+    return _differences(model, h(model, _along_axes(model, X), t, u, d))
+
+
+def _along_axes(model: Model, X: Array) -> Array:
+    """X (n, N), and X plus and minus the step of each entry: (n, 2 N + 1, N)."""
+    if X.ndim != 2 or X.shape[1] != len(model.step):
+        raise ValueError(f"X needs the shape (n, {len(model.step)}), not {X.shape}")
+    step = np.diag(model.step)
+    return X[:, None] + np.concatenate([np.zeros_like(step[:1]), step, -step])
+
+
+def _differences(model: Model, values: Array) -> tuple[Array, Array]:
+    N = len(model.step)
+    columns = (values[:, 1 : N + 1] - values[:, N + 1 :]) / (2 * model.step[:, None])
+    return values[:, 0], np.ascontiguousarray(np.swapaxes(columns, 1, 2))
+
+
+def predict(
+    model: Model, rule: str, X: Array, P: Array, t: Array, u: Array, d: Array | None, Q: Array
+) -> tuple[Array, Array]:
+    """Mean (n, N) and covariance (n, N, N) one sample after t (n,) [s].
+
+    Args:
+        model: The model.
+        rule: One of `RULES`.
+        X: Mean (n, N) at t.
+        P: Its covariance (n, N, N). Where it has lost its definiteness, as little as helps is added to its diagonal.
+        t: Start of the interval (n,) [s].
+        u: Command (n, n_u) held over it.
+        d: Measured disturbance (n, n_D) held over it.
+        Q: Covariance (1, N, N) that a sample adds, or one for each line or episode.
+
+    Raises:
+        ValueError: Unknown rule, or shapes that do not fit.
+    """
+    X1, P1 = np.empty(X.shape), np.empty(P.shape)
+    known = model.unmeasured if d is None else d
+    _call(kernels.predict, (_rule(rule), *model.constants, model.limit, model.linear), X, P, t, u, known, Q, X1, P1)
+    return X1, P1
+
+
+def update(
+    model: Model, rule: str, X: Array, P: Array, t: Array, u: Array, d: Array | None, y: Array, seen: Array, R: Array
+) -> Updated:
+    """Update with the sensors at t.
+
+    Args:
+        model: The model.
+        rule: One of `RULES`; without effect where the model has H.
+        X: Predicted mean (n, N).
+        P: Its covariance (n, N, N).
+        t: Time of the sample (n,) [s].
+        u: Command (n, n_u) held up to it.
+        d: Measured disturbance (n, n_D).
+        y: What the sensors read (n, m).
+        seen: Which of them reported (n, m), bool.
+        R: Covariance of their noise (1, m, m), or one for each line or episode.
+
+    Raises:
+        ValueError: Unknown rule, or shapes that do not fit.
+    """
+    n, m = len(X), model.m
+    X1, P1, nu, S = np.empty(X.shape), np.empty(P.shape), np.empty((n, m)), np.empty((n, m, m))
+    nis, log = np.empty(n), np.empty(n)
+    known = model.unmeasured if d is None else d
+    _call(
+        kernels.update, (_rule(rule), *model.constants, model.H, np.ascontiguousarray(seen)), X, P, t, u, known, y, R,
+        X1, P1, nu, S, nis, log,
+    )  # fmt: skip
+    return Updated(X1, P1, nu, S, nis, log)
+
+
+def correct(X: Array, P: Array, mean: Array, cross: Array, S: Array, y: Array, seen: Array) -> Corrected:
+    """The Kalman correction alone, for a method that brings its own moments.
+
+    Args:
+        X: Predicted mean (n, N).
+        P: Its covariance (n, N, N).
+        mean: Mean of what the sensors read (n, m).
+        cross: Covariance of X with it (n, N, m).
+        S: Its own covariance, noise included (n, m, m).
+        y: What they read (n, m).
+        seen: Which of them reported (n, m), bool.
+
+    Raises:
+        ValueError: Shapes that do not fit.
+    """
+    n, m = mean.shape
+    X1, P1, K = np.empty(X.shape), np.empty(P.shape), np.empty((n, X.shape[1], m))
+    nu, S1, nis, log = np.empty((n, m)), np.empty((n, m, m)), np.empty(n), np.empty(n)
+    _call(kernels.correct, (np.ascontiguousarray(seen),), X, P, y, mean, cross, S, X1, P1, nu, S1, K, nis, log)
+    return Corrected(X1, P1, nu, S1, nis, log, K)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fdi_gym.estimation import gaussian
 from fdi_gym.plant import Array, contiguous
 
 
@@ -90,9 +91,8 @@ def correct(x: Array, P: Array, nu: Array, cross: Array, S: Array, seen: Array) 
 
     K = cross S^-1, x + K nu, P - K cross', with the sensors that reported.
     """
-    nu, S, cross = masked(seen, nu, S, cross)
-    K = right_divide(cross, S)
-    return Corrected(x + times(K, nu), symmetric(P - K @ T(cross)), nu, S, K)
+    done = gaussian.correct(x, P, np.zeros_like(nu), cross, S, nu, seen)
+    return Corrected(done.X, done.P, done.nu, done.S, done.K)
 
 
 def update(x: Array, P: Array, nu: Array, H: Array, R: Array, seen: Array) -> Corrected:

@@ -1,4 +1,4 @@
-"""A plant's augmented model with its constants packed for the compiled steps of `fused`."""
+"""A plant's augmented model with its constants packed for the compiled steps of `gaussian`."""
 
 from __future__ import annotations
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from conftest import PLANTS, build
 
-from fdi_gym.estimation import automaton, fused
-from fdi_gym.estimation.fused import RULES
+from fdi_gym.estimation import automaton, gaussian
+from fdi_gym.estimation.gaussian import RULES
 from fdi_gym.kernels import kernel
 
 
@@ -68,7 +68,7 @@ class Case:
         self.model = self.bind()
 
     def bind(self, **changes):
-        return fused.bind(self.plant, **{
+        return gaussian.bind(self.plant, **{
             "scale": self.scale, "entries": self.entries, "disturbances": self.disturbances, "sensors": self.sensors,
             "limit": self.limit, "lines": (self.offset, self.direction), **changes,
         })  # fmt: skip
@@ -106,11 +106,11 @@ class Case:
 
     def predict(self, rule, **changes):
         given = {"X": self.X, "P": self.P, "t": self.t, "u": self.u, "d": self.d, "Q": self.Q, "model": self.model}
-        return fused.predict(rule=rule, **given | changes)
+        return gaussian.predict(rule=rule, **given | changes)
 
     def update(self, rule, seen, **changes):
         given = {"X": self.X, "P": self.P, "t": self.t, "u": self.u, "d": self.d, "y": self.y, "R": self.R}
-        return fused.update(rule=rule, seen=seen, **{"model": self.model} | given | changes)
+        return gaussian.update(rule=rule, seen=seen, **{"model": self.model} | given | changes)
 
 
 def moments(rule, g, X, P, step):
@@ -159,10 +159,10 @@ def assert_close(X, P, expected_X, expected_P):
 def test_f_and_h_are_the_plants(plant_id, lines):
     case = Case(plant_id, lines)
     points = case.X[:, None] + 0.1 * case.scale * case.rng.standard_normal((EPISODES, 5, len(case.scale)))
-    moved = fused.f(case.model, points, case.t, case.u, case.d)
+    moved = gaussian.f(case.model, points, case.t, case.u, case.d)
     assert moved == pytest.approx(case.f(points), rel=1e-13, abs=1e-13)
     assert np.array_equal(moved[..., len(case.plant.states) :], points[..., len(case.plant.states) :])
-    assert fused.h(case.model, points, case.t, case.u, case.d) == pytest.approx(case.h(points), rel=1e-13, abs=1e-13)
+    assert gaussian.h(case.model, points, case.t, case.u, case.d) == pytest.approx(case.h(points), rel=1e-13, abs=1e-13)
 
 
 @pytest.mark.parametrize("plant_id", ALL_PLANTS)
@@ -170,7 +170,7 @@ def test_f_and_h_are_the_plants(plant_id, lines):
 def test_jacobians_are_central_differences(plant_id, which):
     case = Case(plant_id)
     function = getattr(case, which)
-    value, J = getattr(fused, f"jacobian_{which}")(case.model, case.X, case.t, case.u, case.d)
+    value, J = getattr(gaussian, f"jacobian_{which}")(case.model, case.X, case.t, case.u, case.d)
     assert value == pytest.approx(function(case.X[:, None])[:, 0], rel=1e-13, abs=1e-13)
     step = 1e-3 * case.scale
     plus, minus = (function(case.X[:, None] + sign * np.diag(step)) for sign in (1, -1))
@@ -234,7 +234,7 @@ def test_linear_sensors_are_the_cheap_case_of_the_rules(plant_id):
     seen = case.seen()
     got = case.update("extended", seen, model=case.bind(H=H))
     cross = case.P @ H.T
-    own = fused.correct(case.X, case.P, case.X @ H.T, cross, H @ cross + case.R, case.y, seen)
+    own = gaussian.correct(case.X, case.P, case.X @ H.T, cross, H @ cross + case.R, case.y, seen)
     for i, rows in enumerate(seen):
         S = (H @ case.P[i] @ H.T + case.R[0])[np.ix_(rows, rows)]
         K = case.P[i] @ H[rows].T @ np.linalg.inv(S)
@@ -262,7 +262,7 @@ def test_on_a_linear_plant_every_rule_is_the_kalman_filter(rule, exact):
     case = Case("B747Lateral")
     model = case.model if exact else case.model._replace(linear=np.zeros((0, 0)))
     X, P = case.predict(rule, model=model)
-    F = fused.jacobian_f(case.model, case.X, case.t, case.u, case.d)[1]
+    F = gaussian.jacobian_f(case.model, case.X, case.t, case.u, case.d)[1]
     moved = case.f(case.X[:, None])[:, 0]
     H = np.eye(4, len(case.scale))[case.sensors]
     after = case.update(rule, np.ones(case.y.shape, bool), model=model, X=X, P=P)
@@ -451,9 +451,9 @@ def test_other_bad_input_is_refused():
     with pytest.raises(TypeError, match="documented dimensions"):
         case.predict("extended", Q=case.Q[0])
     with pytest.raises(ValueError, match="the shapes are"):
-        fused.correct(case.X, case.P, case.y[:5], case.P[:, :, :2], case.P[:, :2, :2], case.y, seen)
+        gaussian.correct(case.X, case.P, case.y[:5], case.P[:, :, :2], case.P[:, :2, :2], case.y, seen)
     with pytest.raises(ValueError, match="X needs the shape"):
-        fused.jacobian_f(case.model, case.X[:, :4], case.t, case.u)
+        gaussian.jacobian_f(case.model, case.X[:, :4], case.t, case.u)
     for changes, says in (
         ({"scale": case.scale[:-1]}, "scale needs 6"), ({"scale": -case.scale}, "positive"),
         ({"entries": [0.5, 1.0, 2.0]}, "list of integers"), ({"entries": np.ones((1, 3), int)}, "list of integers"),

@@ -1,15 +1,23 @@
-"""The kernels of `fused`: a batch of episodes in one call, for any plant, by address; compiled once for all plants."""
+"""The kernels of `gaussian`: a batch of episodes in one call, for any plant, by address; compiled once for all plants."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import boolean, float64, int64, void
 
-from fdi_gym.estimation.fused_moments import SIZES, correct_episode, helper, linearised, pass_points, through, through_matrix
+from fdi_gym.estimation.gaussian_moments import (
+    SIZES,
+    correct_episode,
+    helper,
+    linearised,
+    pass_points,
+    through,
+    through_matrix,
+)
 from fdi_gym.kernels import M, V, compiled
 
 I1, B2, M3 = int64[::1], boolean[:, ::1], float64[:, :, ::1]
-# integers, reals, step, offset, direction: the constants of a model that tell its f and h, as `fused.bind` packs them
+# integers, reals, step, offset, direction: the constants of a model that tell its f and h, as `gaussian.bind` packs them
 MODEL = (I1, V, V, M, M3)
 
 
