@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from fdi_gym.diagnosis.fitting import fit_belief, flights_of
 
 from baselines.filters.augmented_gaussian import augmented_ekf
 from baselines.filters.unknown_inputs import known_of
 from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, run
 from fdi_gym.diagnosis.filtering import readings
+from fdi_gym.diagnosis.fitting import fit_belief, flights_of
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.plant import load_plant
 
