@@ -5,7 +5,7 @@ fdi-gym evaluate b747-standard --diagnosers 02_write_a_diagnoser:mean_innovation
 
 import numpy as np
 
-from baselines.filters.windowed_nis import steady_filter
+from baselines.filters.kalman_filter import nominal_filter
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, run
 from fdi_gym.engine import simulate
 from fdi_gym.faults import draw
@@ -15,7 +15,7 @@ from fdi_gym.testing import check_diagnoser
 
 def mean_innovation_test(plant: Plant, *, memory: float = 0.98, limit: float = 4.5) -> Diagnoser:
     """Which innovation is off? Yaw says rudder, roll says aileron; stuck or not it cannot tell."""
-    nominal = steady_filter(plant)
+    nominal = nominal_filter(plant)
     sigma = np.sqrt(np.diag(nominal.S) * (1 - memory) / (1 + memory))  # of an exponentially weighted mean
     aileron, rudder = (plant.label_of(frozenset({f"{surface} stuck"})) for surface in ("aileron", "rudder"))
 
@@ -26,11 +26,13 @@ def mean_innovation_test(plant: Plant, *, memory: float = 0.98, limit: float = 4
         k, x, mean = state
         y, u, _ = plant.split(obs)
         if k > 0:
-            x, nu = nominal.step(x, u, y)
+            x = x @ nominal.model.A.T + u @ nominal.model.B.T
+            nu = y - x @ nominal.model.C.T
+            x = x + nu @ nominal.K.T
             mean = memory * mean + (1 - memory) * nu
         score = np.abs(mean) / sigma
-        mode = np.where(score[:, 2] > limit, rudder, np.where(score[:, 1] > limit, aileron, 0))
-        return (k + 1, x, mean), Diagnosis(mode > 0, mode)
+        label = np.where(score[:, 2] > limit, rudder, np.where(score[:, 1] > limit, aileron, 0))
+        return (k + 1, x, mean), Diagnosis(label > 0, label)
 
     return Diagnoser(init, update)
 

@@ -157,6 +157,37 @@ def freeze(
     print(write(suite, folder or SUITES))
 
 
+def fit(
+    plant: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PLANT")],
+    diagnosers: Names = ("all",),
+    jobs: int = -1,
+    output: Path | None = None,
+) -> None:
+    """Fit what methods know of a plant, for all suites of it that are here: beliefs, and calibrations on healthy flights.
+
+    Args:
+        plant: Plant or environment id; "module:id" where the module registers it.
+        diagnosers: Names; "all" for every one that takes any.
+        jobs: Worker processes, -1 for one per core.
+        output: Folder that gets PLANT.json. Default: `fits` in the package of the methods, whence they are read.
+    """
+    from fdi_gym.diagnosis import diagnosers as known
+    from fdi_gym.diagnosis import find_diagnoser, knowledge
+    from fdi_gym.listing import find_plant
+    from fdi_gym.suite import load_suite, suite_names
+
+    plant_id = find_plant(plant)[1]
+    names = list(known()) if diagnosers == ("all",) else list(dict.fromkeys(diagnosers))
+    entries = [entry for entry in map(find_diagnoser, names) if entry.takes("belief") or entry.takes("calibration")]
+    suites = [suite for suite in map(load_suite, suite_names()) if suite.plant == plant_id]
+    if not entries or not suites:
+        raise ValueError(f"nothing to fit: {len(suites)} suites of {plant_id}, {len(entries)} methods that take a belief")
+    for path, found in knowledge.fit_suites(entries, suites, jobs).items():
+        place = path if output is None else output / path.name
+        knowledge.write_fits(place, found)
+        print(f"{len(found.beliefs)} beliefs and {len(found.calibrations)} calibrations in {place}")
+
+
 def train(
     method: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="METHOD")],
     plant: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PLANT")],
@@ -190,7 +221,8 @@ def train(
 
 
 COMMANDS: dict[str, Any] = {
-    "evaluate": evaluate, "verify": verify, "leaderboard": render, "list": show, "freeze": freeze, "train": train,
+    "evaluate": evaluate, "verify": verify, "leaderboard": render, "list": show, "freeze": freeze, "fit": fit,
+    "train": train,
 }  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from baselines.filters.mekf import observation
 from fdi_gym.diagnosis import find_diagnoser, make_diagnoser, run
 from fdi_gym.engine import simulate
 from fdi_gym.estimation.augmented import Interval
+from fdi_gym.estimation.sigma_points import covariance, mean_and_deviations, unscented_points, weights
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
@@ -92,13 +93,13 @@ def test_dual_updates_are_the_textbooks_with_the_missing_rows_removed():
         moved = PLANT.propagate(0.0, np.concatenate([x[..., :3], q4, x[..., 3:]], axis=-1), at.u, f)
         return np.delete(moved, 3, axis=-1)
 
-    passed = unscented(seen_through, ahead.f, ahead.P_f, np.ones(4))
+    points, w = unscented_points(ahead.f, ahead.P_f), weights(4)
+    mean, deviations = mean_and_deviations(seen_through(points), w)
+    cross, spread = covariance(points - ahead.f[:, None], deviations, w), covariance(deviations, deviations, w)
     for i in range(12):
         x, P, there = ahead.now.x[i], ahead.now.P[i], seen[i, :10]
         near((after.now.x[i], after.now.P[i]), rows_removed(x, P, y[i, :10] - x, P, P + R, there), P)
-        expected = rows_removed(
-            ahead.f[i], ahead.P_f[i], y[i, :10] - passed.mean[i], passed.cross[i], passed.P[i] + P + R, there
-        )
+        expected = rows_removed(ahead.f[i], ahead.P_f[i], y[i, :10] - mean[i], cross[i], spread[i] + P + R, there)
         near((after.f[i], after.P_f[i]), expected, ahead.P_f[i])
 
 

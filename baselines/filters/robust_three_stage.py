@@ -27,7 +27,7 @@ from baselines.filters.propagation import Propagated, propagation_of, trim_model
 from baselines.filters.unknown_inputs import Known, decided, known_of
 from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser
 from fdi_gym.diagnosis.contract import choose
-from fdi_gym.estimation.augmented import Interval
+from fdi_gym.estimation.augmented import Interval, plus_held_commands
 from fdi_gym.estimation.belief import Belief, FaultInputs
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading
@@ -230,7 +230,8 @@ def robust_three_stage_filter(plant: Plant, known: Known, rule: str) -> Filter:
 
     def ahead(s: RobustThreeStage, at: Interval) -> RobustThreeStage:
         none = np.zeros((len(s.x), p)), np.zeros((len(s.x), q))
-        return predict(s, propagate((at.k - 1) * plant.dt, s.x, s.P, at.u, *none), known.Q)
+        after = predict(s, propagate((at.k - 1) * plant.dt, s.x, s.P, at.u, *none), known.Q)
+        return after if at.stale is None else after._replace(P=plus_held_commands(plant, after.P, s.x, at))
 
     def measured(s: RobustThreeStage, at: Interval, y: Array, seen: Array) -> RobustThreeStage:
         return update(s, y[:, known.sensors], seen[:, known.sensors], known.H, known.R)

@@ -7,7 +7,7 @@ Nothing of a test flight is used. `fdi_gym.diagnosis.knowledge` ships and keeps 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -211,16 +211,13 @@ def fit_calibration(
     return msgspec.structs.replace(silent, thresholds=thresholds, rise=level)
 
 
-def fit(
-    method: str, plant: Plant, process: str = "standard", *, scenarios: Sequence[FaultScenario] | None = None, **tuning: Any
-) -> tuple[Belief | None, Calibration | None]:
+def fit(method: str, plant: Plant, process: str = "standard", **tuning: Any) -> tuple[Belief | None, Calibration | None]:
     """What a method may know of a plant and one of its fault processes, found anew from flights.
 
     Args:
         method: Name of a diagnoser, or "module:function".
         plant: The plant.
         process: The fault process that will be met.
-        scenarios: Unused by honest methods; a clairvoyant one needs none to be fitted.
         tuning: Keyword arguments of its builder.
 
     Returns:

@@ -17,7 +17,7 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -26,6 +26,7 @@ from fdi_gym.diagnosis.registry import Entry, find_diagnoser, package_of
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.data import from_json, to_json
+from fdi_gym.files import write_whole
 from fdi_gym.kernels import cache_folder
 from fdi_gym.plant import NotApplicableError, Plant, plant_sources
 
@@ -130,33 +131,53 @@ def knowledge_of(entry: Entry, plant: Plant, process: str, settings: Mapping[str
 def write_fits(path: Path, fits: Fits) -> None:
     """Write a plant's file, indented for readers."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(msgspec.json.format(to_json(fits), indent=1) + b"\n")
+    write_whole(path, msgspec.json.format(to_json(fits), indent=0) + b"\n")
 
 
-def fit_all(plant: Plant, work: Sequence[tuple[Entry, str, Mapping[str, Any]]], jobs: int = -1) -> Fits:
-    """The fits of several methods (entry, process, settings) on a plant, found anew, side by side.
+class Task(NamedTuple):
+    """One fit: a method on a plant, a fault process and its settings."""
+
+    entry: Entry
+    plant: Plant
+    process: str
+    settings: Mapping[str, Any]
+
+
+def fit_suites(entries: Sequence[Entry], suites: Sequence[Any], jobs: int = -1) -> dict[Path, Fits]:
+    """The fits of methods on the suites of one plant, found anew, side by side; by the file that they belong into.
 
     Methods that cannot run on the plant have none.
     """
     import joblib
 
-    processes = sorted({process for _, process, _ in work})
-    needed = [process for process in processes if any(p == process and entry.takes("belief") for entry, p, _ in work)]
-    beliefs = dict(zip(needed, joblib.Parallel(jobs)(joblib.delayed(_belief)(plant, p) for p in needed), strict=True))
-    tasks = [task for task in work if task[0].takes("calibration")]
-    found = joblib.Parallel(jobs, batch_size=1)(  # type: ignore[arg-type]
-        joblib.delayed(_calibration)(entry.name, plant, process, dict(settings), beliefs.get(process))
-        for entry, process, settings in tasks
+    tasks: dict[str, Task] = {}
+    for suite in suites:
+        plant = suite.build()
+        for entry in entries:
+            settings = entry.resolve(plant, **suite.settings.get(entry.name, {}))
+            key = calibration_key(entry, plant, suite.process, settings)
+            tasks[key] = Task(entry, plant, suite.process, settings)
+    wanted = {belief_key(t.plant, t.process): t for t in tasks.values() if t.entry.takes("belief")}
+    made = joblib.Parallel(jobs)(joblib.delayed(_belief)(t.plant, t.process) for t in wanted.values())
+    beliefs: dict[str, Belief | None] = dict(zip(wanted, made, strict=True))
+    calls = [
+        joblib.delayed(_calibration)(t.entry.name, *t[1:], beliefs.get(belief_key(t.plant, t.process)))
+        for t in tasks.values() if t.entry.takes("calibration")
+    ]  # fmt: skip
+    found = dict(
+        zip([k for k, t in tasks.items() if t.entry.takes("calibration")], joblib.Parallel(jobs)(calls), strict=True)
     )
-    calibrations = {
-        calibration_key(entry, plant, process, settings): calibration
-        for (entry, process, settings), calibration in zip(tasks, found, strict=True)
-        if calibration is not None
-    }
-    return Fits(
-        plant=plant.id, code=code_digest(plant),
-        beliefs={belief_key(plant, p): b for p, b in beliefs.items() if b is not None}, calibrations=calibrations,
-    )  # fmt: skip
+    files: dict[Path, Fits] = {}
+    for key, task in tasks.items():
+        home = package_of(task.entry)
+        path = (home or Path()) / "fits" / f"{task.plant.id}.json"
+        fits = files.setdefault(path, Fits(plant=task.plant.id, code=code_digest(task.plant)))
+        believed = belief_key(task.plant, task.process)
+        if task.entry.takes("belief") and (belief := beliefs[believed]) is not None:
+            fits.beliefs[believed] = belief
+        if (calibration := found.get(key)) is not None:
+            fits.calibrations[key] = calibration
+    return files
 
 
 def _belief(plant: Plant, process: str) -> Belief | None:
@@ -176,11 +197,3 @@ def _calibration(
         return fit_calibration(entry, plant, process, settings, belief)
     except NotApplicableError:
         return None
-
-
-def joined(parts: Sequence[Fits]) -> Fits:
-    """The fits of one plant with different options, in one file."""
-    first = parts[0]
-    beliefs = {key: b for part in parts for key, b in part.beliefs.items()}
-    calibrations = {key: c for part in parts for key, c in part.calibrations.items()}
-    return Fits(plant=first.plant, code=first.code, beliefs=beliefs, calibrations=calibrations)
