@@ -225,7 +225,8 @@ class Flights:
         """An empty chunk of so many samples."""
         plant, n = self.plant, len(self)
         widths = len(plant.observed), len(plant.states), len(plant.theta)
-        return Chunk(*(np.zeros((samples, n, width)) for width in widths), np.zeros((samples, n), np.int64))
+        obs, state, theta = (np.zeros((samples, n, width)) for width in widths)
+        return Chunk(obs, state, theta, np.zeros((samples, n), np.int64))
 
 
 def advance(

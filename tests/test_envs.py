@@ -305,7 +305,20 @@ def test_specs_survive_json_whatever_they_hold(make):
 # What is handed in
 
 
-BAD_SEEDS = [-1, 1.0, "7", True, np.bool_(True), np.float64(3), b"1", object(), float("nan"), [1.5, 2, 3], [True, 1, 2], [-1, 0, 1]]
+BAD_SEEDS = [
+    -1,
+    1.0,
+    "7",
+    True,
+    np.bool_(True),
+    np.float64(3),
+    b"1",
+    object(),
+    float("nan"),
+    [1.5, 2, 3],
+    [True, 1, 2],
+    [-1, 0, 1],
+]
 
 
 @pytest.mark.parametrize("seed", BAD_SEEDS, ids=repr)
@@ -410,7 +423,8 @@ BAD_ARGUMENTS = [
     ({"decision_period": True}, "decision_period"), ({"decision_period": 2.0}, "decision_period"),
     ({"mismatch": -0.1}, "mismatch"), ({"mismatch": np.nan}, "mismatch"), ({"mismatch": "0.1"}, "mismatch"),
     ({"mismatch": True}, "mismatch"), ({"scenario": 5}, "scenario"), ({"process": 5}, "standard"),
-    ({"process": "hard", "scenario": "SCENARIO"}, "replayed as it is"), ({"mismatch": 0.1, "scenario": "SCENARIO"}, "replayed"),
+    ({"process": "hard", "scenario": "SCENARIO"}, "replayed as it is"),
+    ({"mismatch": 0.1, "scenario": "SCENARIO"}, "replayed as it is"),
 ]  # fmt: skip
 
 
@@ -442,7 +456,12 @@ def test_truth_on_request_is_the_info(plant, mode):
     for _ in range(25):
         truth = untold.truth()
         assert all(np.array_equal(truth[name], infos[name]) for name in infos if name in truth)
-        assert {*truth, *(f"_{name}" for name in truth)} == infos.keys() - {"final_obs", "_final_obs", "final_info", "_final_info"}
+        assert {*truth, *(f"_{name}" for name in truth)} == infos.keys() - {
+            "final_obs",
+            "_final_obs",
+            "final_info",
+            "_final_info",
+        }
         if mode is AutoresetMode.DISABLED and told._over.any():
             infos = told.reset(options={"reset_mask": np.ones(2, bool)})[1]
             untold.reset(options={"reset_mask": np.ones(2, bool)})
