@@ -74,17 +74,6 @@ def per_step(env, steps=60_000):
     return 1e6 * (time.process_time() - start) / steps
 
 
-def steps_per_second(envs, steps):
-    """Environment steps per second of a vector environment."""
-    envs.reset(seed=0)
-    action = np.zeros(envs.num_envs, dtype=int)
-    envs.step(action)
-    start = time.process_time()
-    for _ in range(steps):
-        envs.step(action)
-    return steps * envs.num_envs / (time.process_time() - start)
-
-
 def filter_times(n=64, steps=300):
     """Microseconds per filter step and episode: ours in a batch, FilterPy's on the same augmented model."""
     plant = load_plant("B747Lateral")
@@ -123,7 +112,6 @@ def main():
     single = {
         "B747Lateral-Faults-v0": env,
         "the same in plain NumPy": gym.wrappers.OrderEnforcing(gym.wrappers.PassiveEnvChecker(PlainB747())),
-        "CartPole-v1": gym.make("CartPole-v1"),
     }
     for name in single:
         per_step(single[name], 3000)  # warm
@@ -132,12 +120,6 @@ def main():
     print("one environment step from Python, us")
     for name, value in times.items():
         print(f"  {name:36s} {value:9.2f}   {value / ours:7.2f} x")
-    many = gym.make_vec("B747Lateral-Faults-v0", num_envs=1024)
-    loop = gym.make_vec("B747Lateral-Faults-v0", num_envs=1024, vectorization_mode="sync")
-    rates = {"native vector environment": steps_per_second(many, 2400), "SyncVectorEnv": steps_per_second(loop, 40)}
-    print("1,024 environments, million steps per second")
-    for name, value in rates.items():
-        print(f"  {name:36s} {value / 1e6:9.3f}   {rates['native vector environment'] / value:7.1f} x")
     times = filter_times()
     print("one filter step per episode, us (ours in a batch of 64)")
     for name, value in times.items():

@@ -1,6 +1,6 @@
 """A Kalman filter of state and faults, with a decision: gaps, counters and thresholds are the framework's business.
 
-    fdi-gym evaluate b747-standard --diagnosers 06_write_a_filter:my_filter
+fdi-gym evaluate b747-standard --diagnosers 06_write_a_filter:my_filter
 """
 
 import numpy as np

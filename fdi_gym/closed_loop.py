@@ -8,6 +8,8 @@ theta that a hold fault owns take their value; the plant advances to x_{k+1} und
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 import numpy as np
 from numba import float64, int64, types, uint64, void
@@ -31,14 +33,15 @@ GAIN, BIAS, NOISE, FROZEN, LAG, MISSING, FAULTS = range(7)
 FLYING, ENDED, OVER, TERMINATED = range(4)  # ENDED: its last sample is still to be shown; TERMINATED: over, before its time
 
 
-@intrinsic
-def _pointer(typing_context, where):
-    """A pointer to float64 from its address."""
-
+def _pointer_at(typing_context, where):
     def codegen(context, builder, _, arguments):
         return builder.inttoptr(arguments[0], cgutils.voidptr_t)
 
     return types.voidptr(int64), codegen
+
+
+_pointer: Any = intrinsic(_pointer_at)  # a pointer from an address
+_at: Any = numba.carray  # type: ignore[attr-defined]  # the array there
 
 
 @numba.njit
@@ -71,7 +74,7 @@ def _effects(k, seen, dt, table, count, values, held, nominal, a, b, g):
             a[j] = value if half % 2.0 == 0.0 else table[e, SECOND]
         elif kind == SAMPLES:
             last = np.int64(table[e, FIRST]) - 1
-            a[j] = numba.carray(_pointer(values[e]), (last + 1,), float64)[min(k - onset, last)]
+            a[j] = _at(_pointer(values[e]), (last + 1,), float64)[min(k - onset, last)]
         elif seen and k == onset:
             a[j] = nominal[j]
         else:
@@ -161,10 +164,10 @@ def fly(
             injected = process_noise[slot] != 0
             if not (injected or steady):
                 fill(seed[slot], k, min(TILE, samples - tile), used, words, normals)
-            references = numba.carray(_pointer(reference_at[slot]), (last + 1, n_r), float64)
-            disturbances = numba.carray(_pointer(disturbance_at[slot]), (last + 1, n_d), float64)
-            w = numba.carray(_pointer(process_noise[slot]), (last, n), float64)
-            v = numba.carray(_pointer(sensor_noise[slot]), (last + 1, n_y), float64)
+            references = _at(_pointer(reference_at[slot]), (last + 1, n_r), float64)
+            disturbances = _at(_pointer(disturbance_at[slot]), (last + 1, n_d), float64)
+            w = _at(_pointer(process_noise[slot]), (last, n), float64)
+            v = _at(_pointer(sensor_noise[slot]), (last + 1, n_y), float64)
             acting, count, values_i, held_i = effects[slot], counts[slot], values[slot], held[slot]
             readings_i, history, segment = readings[slot], histories[slot], 0
             for s in range(tile, min(tile + TILE, samples)):

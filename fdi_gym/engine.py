@@ -138,24 +138,24 @@ class Flights:
         scenarios: Sequence[FaultScenario],
         noise: Sequence[tuple[Array, Array]] | None = None,
     ) -> None:
-        """Put new flights in these slots; the others go on."""
+        """Put new flights in these slots; the others go on. What is refused leaves all as they are."""
         plant = self.plant
-        for number, (i, scenario) in enumerate(zip(slots, scenarios, strict=True)):
-            plant.validate(scenario)
-            steps = scenario.steps
-            reference, disturbance, physical = plant.inputs(scenario)
+        made = [self._made(s, None if noise is None else noise[number]) for number, s in enumerate(scenarios)]
+        for i, scenario, (reference, disturbance, p, given) in zip(slots, scenarios, made, strict=True):
             self.widths[:] = reference.shape[1], disturbance.shape[1]
-            given: tuple[Array | None, Array | None] = (None, None)
-            if noise is not None:
-                given = self._checked_noise(noise[number], steps)
             self.x[i] = plant.trim_state if scenario.x0 is None else scenario.x0
-            self.p[i] = physical
-            self.c[i], self.u[i], self.theta[i] = plant.c0, plant.trim_command, plant.nominal_theta
-            self.k[i], self.length[i], self.status[i], self.seed[i] = 0, steps, FLYING, scenario.noise_seed
+            self.p[i], self.c[i], self.u[i], self.theta[i] = p, plant.c0, plant.trim_command, plant.nominal_theta
+            self.k[i], self.length[i], self.status[i], self.seed[i] = 0, scenario.steps, FLYING, scenario.noise_seed
             samples = self._set_effects(i, scenario)
             self._set_labels(i, plant.label_changes(scenario))
             self.tables[i] = (reference, disturbance, *given, samples)
             self._point(i)
+
+    def _made(self, scenario: FaultScenario, noise: tuple[Array, Array] | None) -> tuple[Array, Array, Array, Any]:
+        """Reference, disturbance, physical parameters and injected noise of a scenario that the plant has accepted."""
+        self.plant.validate(scenario)
+        reference, disturbance, p = self.plant.inputs(scenario)
+        return reference, disturbance, p, (None, None) if noise is None else self._checked_noise(noise, scenario.steps)
 
     def _checked_noise(self, noise: tuple[Array, Array], steps: int) -> tuple[Array, Array]:
         w, v = (contiguous(a) for a in noise)
@@ -222,7 +222,8 @@ class Flights:
         """An empty chunk of so many samples."""
         plant, n = self.plant, len(self)
         widths = len(plant.observed), len(plant.states), len(plant.theta)
-        return Chunk(*(np.zeros((samples, n, width)) for width in widths), np.zeros((samples, n), np.int64))
+        obs, state, theta = (np.zeros((samples, n, width)) for width in widths)
+        return Chunk(obs, state, theta, np.zeros((samples, n), np.int64))
 
 
 def advance(

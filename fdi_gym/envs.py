@@ -17,7 +17,7 @@ from fdi_gym.rules import Rules, Specified, checked_mask, checked_seed, checked_
 
 # Samples that are flown ahead of the agent: few after a reset, since an episode may be short, and twice as many each time.
 # `python benchmarks/engine.py --chunks` measures what the two cost.
-FIRST, CHUNK = 16, 256
+FIRST, CHUNK = 16, 128
 
 
 def ahead(before: int, period: int) -> int:
@@ -111,11 +111,11 @@ class FDIEnv(Specified, gym.Env):
         seed, replay = checked_seed(seed), self._rules.checked_options(options, ("scenario",)).get("scenario")
         super().reset(seed=seed)
         episode_seed = int(self.np_random.integers(2**63)) if seed is None else seed
-        self.scenario = self._rules.draw(episode_seed) if replay is None else replay
+        self.scenario = scenario = self._rules.draw(episode_seed) if replay is None else replay
         if self._flights is None:
-            self._flights = Flights(self.plant, [self.scenario])
+            self._flights = Flights(self.plant, [scenario])
         else:
-            self._flights.begin([0], [self.scenario])
+            self._flights.begin([0], [scenario])
         self._k, self._over, self._declared, self._record = 0, False, [], None
         self._base, self._flown, self._ahead = 0, 0, 0
         self._fly()

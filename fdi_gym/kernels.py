@@ -163,7 +163,7 @@ def _lazily(function: Callable[..., Any], signature: Any) -> Any:
         before = settings.CACHE_DIR
         settings.CACHE_DIR = str(folder)
         try:
-            dispatcher._cache = _Cache(function)
+            dispatcher._cache = _Cache(function)  # type: ignore[attr-defined]
         except (RuntimeError, OSError):  # numba finds no place for it
             pass
         finally:

@@ -396,7 +396,7 @@ def damaged(data, how, rng):
 @pytest.mark.parametrize("how", ["empty", "cut", "garbage", "a bit"])
 def test_a_damaged_cache_is_compiled_anew(tmp_path, how):
     expected = fly_in_another_process(tmp_path)
-    files = [path for path in tmp_path.rglob("*.nb?")]
+    files = list(tmp_path.rglob("*.nb?"))
     assert {path.suffix for path in files} == {".nbi", ".nbc"}
     rng = np.random.default_rng(0)
     for path in files:
@@ -416,8 +416,8 @@ def test_a_damaged_cache_file_is_an_absent_one(tmp_path):
             return x[0] > 1.0
     """)
     )
-    code = ("import numpy as np, small; from fdi_gym import kernels; kernels.address(small.outside); "
-            "print(small.outside(0.0, np.array([2.0]), np.empty(0)), sum(small.outside.stats.cache_hits.values()))")  # fmt: skip
+    code = """import numpy as np, small; from fdi_gym import kernels; kernels.address(small.outside)
+print(small.outside(0.0, np.array([2.0]), np.empty(0)), sum(small.outside.stats.cache_hits.values()))"""
     cache = tmp_path / "cache"
 
     def run():

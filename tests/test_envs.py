@@ -423,7 +423,8 @@ BAD_ARGUMENTS = [
     ({"decision_period": True}, "decision_period"), ({"decision_period": 2.0}, "decision_period"),
     ({"mismatch": -0.1}, "mismatch"), ({"mismatch": np.nan}, "mismatch"), ({"mismatch": "0.1"}, "mismatch"),
     ({"mismatch": True}, "mismatch"), ({"scenario": 5}, "scenario"), ({"process": 5}, "standard"),
-    ({"process": "hard", "scenario": "SCENARIO"}, "replayed as it is"), ({"mismatch": 0.1, "scenario": "SCENARIO"}, "replayed"),
+    ({"process": "hard", "scenario": "SCENARIO"}, "replayed as it is"),
+    ({"mismatch": 0.1, "scenario": "SCENARIO"}, "replayed as it is"),
 ]  # fmt: skip
 
 
