@@ -45,8 +45,8 @@ def observed(plant):
 
 
 @pytest.mark.parametrize(("field", "value", "says"), [
-    ("label", 99, "labels in 0"), ("label", -2, "labels in 0"), ("label", -1, "labels in 0"), ("label", 65536, "labels in 0"),
-    ("label", 2**40, "labels in 0"), ("label", 0.9, "integer"), ("label", 1.0, "integer"),
+    ("label", 99, "labels in 0"), ("label", -2, "labels in 0"), ("label", -1, "labels in 0"),
+    ("label", 65536, "labels in 0"), ("label", 2**40, "labels in 0"), ("label", 0.9, "integer"), ("label", 1.0, "integer"),
     ("alarm", 1, "bool"), ("alarm", 0.5, "bool"),
 ])  # fmt: skip
 @pytest.mark.parametrize("plant_id", PLANTS)
@@ -127,7 +127,7 @@ def test_an_empty_batch_is_an_empty_answer(plant_id):
 
 
 def test_a_batch_that_fails_is_done_one_by_one(b747):
-    """A singular matrix in one episode: that one is lost, the others get what they would have got alone, counters included."""
+    """A singular matrix in one episode: that one is lost, the others get what they would have got alone."""
 
     def update(state, obs):
         k, total = state

@@ -41,7 +41,7 @@ def likelihood_ratios(threshold: float, release: float | None, after: Persistenc
         ratios = 0.5 * (r.cost[:, :1] - r.cost[:, 1:])
         largest = ratios.max(axis=1)
         over = largest > threshold
-        best = np.where(over, 1 + np.argmax(ratios, axis=1), s.best)
+        best = np.where(over, 1 + np.argmax(ratios, axis=1), s.last)
         s = declare(s, best, over, largest < floor, after, informed)
         return s, Verdict(s.label > 0, s.label, evidence=Evidence(r.cost))
 
