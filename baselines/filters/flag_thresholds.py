@@ -17,7 +17,6 @@ from fdi_gym.engine import simulate
 from fdi_gym.estimation.flags import largest
 from fdi_gym.estimation.propagation import FaultInputs
 from fdi_gym.plant import Array, Plant
-from fdi_gym.plants.huav_hover import prescribed_noise
 
 MRAD = 1e-3
 CALIBRATION_SEEDS = range(5000, 5100)
@@ -80,6 +79,8 @@ def calibrate(
         seeds: Flight s has its scenario from default_rng([s, 1]) and noise seed s + 1,000,000.
         quantile: Share of the fault-free flights that shall not reach the threshold.
     """
+    from fdi_gym.plants.huav_hover import prescribed_noise  # the table's flights are numbered ones
+
     process = plant.process("fault-free")
     scenarios = [process.sample(np.random.default_rng([s, 1])).replace(noise_seed=s + 1_000_000) for s in seeds]
     noise = [prescribed_noise(np.random.default_rng(s.noise_seed), s.steps) for s in scenarios]
