@@ -1,5 +1,7 @@
 """The bridge to stable-baselines3 gives the numbers of DummyVecEnv; windows and rewards are those of a slow twin."""
 
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -167,3 +169,81 @@ def test_weights_and_task_of_the_delay_aware_reward():
         DelayAwareReward(gym.make_vec("B747Lateral-Faults-v0", num_envs=2), weights=[1.0])
     with pytest.raises(ValueError, match="at least 1"):
         VectorHistory(gym.make_vec("B747Lateral-Faults-v0", num_envs=2), 0)
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# The contracts of single environments
+
+
+def test_a_reset_of_one_is_of_one_alone():
+    bridge, dummy = both("B747Lateral", decision_period=20)
+    bridge.reset(), dummy.reset()
+    for venv in (bridge, dummy):
+        venv.step(np.zeros(N, int))
+    for indices, seed in (([0], 3), (2, np.int64(5)), ([1, 2], 8), (None, 9)):
+        ours, theirs = (venv.env_method("reset", indices=indices, seed=seed) for venv in (bridge, dummy))
+        assert len(ours) == len(theirs)
+        for (obs, info), (obs_, info_) in zip(ours, theirs, strict=True):
+            assert np.array_equal(obs, obs_)
+            assert info.keys() == info_.keys()
+            assert all(np.array_equal(info[name], info_[name]) for name in info)
+        for _ in range(3):
+            assert np.array_equal(bridge.step(np.zeros(N, int))[0], dummy.step(np.zeros(N, int))[0])
+    assert bridge.get_attr("scenario") == dummy.get_attr("scenario")
+
+
+def test_a_scenario_reaches_the_environments_that_are_meant():
+    bridge, dummy = both("B747Lateral")
+    scenario = dummy.envs[0].plant.process("hard").sample(np.random.default_rng(0))
+    bridge.set_options({"scenario": scenario}), dummy.set_options({"scenario": scenario})
+    assert np.array_equal(bridge.reset(), dummy.reset())
+    assert bridge.get_attr("scenario") == [scenario] * N
+    bridge.reset()
+    bridge.env_method("reset", indices=[1], options={"scenario": scenario})
+    assert [s == scenario for s in bridge.get_attr("scenario")] == [False, True, False]
+
+
+def test_what_all_share_is_not_dealt_out():
+    """Three labels, three environments: an answer of that length is one answer."""
+    bridge, _ = both("B747Lateral")
+    bridge.reset()
+    bridge.envs.unwrapped.three = lambda: ["a", "b", "c"]
+    assert bridge.env_method("three") == [["a", "b", "c"]] * N
+    assert bridge.get_attr("scenarios")[0] == bridge.get_attr("scenario")
+    for refused in (lambda: bridge.env_method("three", indices=[0]), lambda: bridge.env_method("step", np.zeros(N, int))):
+        with pytest.raises(ValueError, match="the environments share"):
+            refused()
+    for indices in (N, [-1], [0, 7], "0", [0.5], [True]):
+        with pytest.raises((ValueError, TypeError), match="environment"):
+            bridge.env_method("reset", indices=indices)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "3", True])
+def test_bad_seeds_are_refused_before_the_reset(seed):
+    bridge, _ = both("B747Lateral")
+    with pytest.raises((ValueError, TypeError), match="seed"):
+        bridge.seed(seed)
+    bridge.reset()
+
+
+@pytest.mark.parametrize("options", [{"mask": 1}, {"reset_mask": np.ones(N, bool)}, [{}, {}], "scenario", [1, 2, 3]])
+def test_bad_options_are_refused(options):
+    bridge, _ = both("B747Lateral")
+
+    def reset():
+        bridge.set_options(options)
+        bridge.reset()
+
+    with pytest.raises((ValueError, TypeError), match="option"):
+        reset()
+
+
+def test_the_bridge_travels():
+    bridge, _ = both("B747Lateral", decision_period=20)
+    bridge.reset()
+    for _ in range(30):
+        bridge.step(np.zeros(N, int))
+    other = pickle.loads(pickle.dumps(bridge))
+    for _ in range(60):
+        for ours, theirs in zip(bridge.step(np.ones(N, int))[:3], other.step(np.ones(N, int))[:3], strict=True):
+            assert ours.tobytes() == theirs.tobytes()

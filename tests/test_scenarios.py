@@ -315,7 +315,6 @@ WRONG = {
     "c0": lambda p: {"c0": np.array([NAN])},
     "q": lambda p: {"q": np.zeros((2, 2))},
     "isolation_reward": lambda p: {"isolation_reward": np.eye(len(p.labels) + 1)},
-    "tuning": lambda p: {"tuning": {"augmented_ekf": 3}},
     "standard": lambda p: {"processes": [FaultProcess(name="hard", description="", sample=p.processes["standard"].sample)]},
     "two processes": lambda p: {"processes": [p.processes["standard"]] * 2},
     "process": lambda p: {"processes": {**p.processes, "easy": p.processes["standard"]}},
