@@ -161,10 +161,11 @@ def main():
 
     length = {plant: draw(load_plant(plant).process("standard"), 0).steps for plant in plants}
     many = {plant: gym.make_vec(ids[plant], num_envs=1024) for plant in plants}
+    many |= {f"{plant} truth=False": gym.make_vec(ids[plant], num_envs=1024, truth=False) for plant in plants}
     many["CartPole"] = gym.make_vec("CartPole-v1", num_envs=1024, vectorization_mode="vector_entry_point")
     for envs in many.values():
         envs.reset(seed=0)
-    steps = {plant: min(length[plant], 2500) for plant in plants} | {"CartPole": 1000}
+    steps = {name: min(length.get(name.split()[0], 1000), 2500) for name in many}
     rates = interleaved({name: lambda e=envs, s=steps[name]: amortised(e, s) for name, envs in many.items()},
                         max(arguments.repeats // 2, 1))  # fmt: skip
     print(f"\n{'1,024 at once, M steps/s':32s} {'CPU':>7s} {'wall':>7s}   over a flight, or 2,500 steps of a longer one")

@@ -1,4 +1,4 @@
-"""Compiled generic kernels: what every plant shares, written once for any plant's equations.
+"""How equations become compiled functions, and how the generic kernels call those of any plant.
 
 A plant file writes its equations as plain functions and marks them with `kernel`. The parameter names say which
 role a function has, and the role fixes its compiled signature:
@@ -13,11 +13,12 @@ role a function has, and the role fixes its compiled signature:
 with t the time [s], x the state, theta the fault parameter, d the disturbance, p the physical parameters, r the row
 of exogenous references, q the controller's parameters. A function with any other parameters is a helper that the
 file's kernels may call. A kernel must not call a kernel of another file, which is what keeps numba's disk cache valid:
-the generic kernels below get the addresses of the plant's compiled functions (`address`) and call through them. So
-they are compiled once for all plants, nothing is compiled to bring the two together, and a call costs a microsecond.
+the generic kernels (`integration.py`, `closed_loop.py`) get the addresses of the plant's compiled functions (`address`)
+and call through them. So they are compiled once for all plants, and nothing is compiled to bring the two together.
 
 The cache lies in the user's cache folder (or `FDI_GYM_CACHE_DIR`) under a hash of the file that defines the kernel and
-of the files of the package that it imports, so that no edit is ever answered by old code.
+of the files of the package that it imports, so that no edit is ever answered by old code. A damaged file there is an
+absent one, and where nothing can be written, everything is compiled in each process.
 """
 
 from __future__ import annotations
@@ -197,7 +198,7 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 
 def compiled(signature: Any) -> Callable[[Any], Any]:
-    """Make a generic kernel of this file: compiled for this signature at its first call, cached."""
+    """Make a generic kernel: compiled for this signature at its first call, cached; it runs without the GIL."""
 
     def decorate(function: Callable[..., Any]) -> Any:
         dispatcher = _lazily(function, signature)

@@ -12,8 +12,8 @@ import time
 import pytest
 from conftest import PLANTS, ROOT
 
-from fdi_gym import __version__, cli, diagnosis, suite
-from fdi_gym.diagnosis import broken_plugins, diagnosers
+from fdi_gym import __version__, cli, suite
+from fdi_gym.diagnosis import broken_plugins, diagnosers, registry
 from fdi_gym.suite import Suite, freeze, load_suite, suite_names
 from fdi_gym.training import trainers
 
@@ -248,7 +248,7 @@ def test_what_is_broken_does_not_stop_list(capsys, here, small, monkeypatch):
     monkeypatch.setattr(suite, "SUITES", here)
     points = [importlib.metadata.EntryPoint(f"p{i}", value, "fdi_gym.diagnosers")
               for i, value in enumerate(("broken_plugin", "good_plugin", "missing", "baselines.trivial"))]  # fmt: skip
-    monkeypatch.setattr(diagnosis, "entry_points", lambda group: points)
+    monkeypatch.setattr(registry, "entry_points", lambda group: points)
     broken_plugins.cache_clear()
     try:
         code, out, err = said(capsys, "list")
@@ -283,7 +283,7 @@ def test_help_says_what_a_word_stands_for(capsys, command):
     assert code == 0
     assert not re.search(r"\bSTR\b", out)
     assert {"evaluate": "SUITE", "verify": "ROW", "leaderboard": "PATH", "list": "NAME", "freeze": "PLANT",
-            "train": "METHOD"}[command] in out  # fmt: skip
+            "train": "METHOD", "fit": "PLANT"}[command] in out  # fmt: skip
 
 
 @pytest.mark.parametrize("arguments", [("list",), ("--help",), ("list", "B747Lateral"), ("list", "nothing")], ids=" ".join)

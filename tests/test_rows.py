@@ -13,9 +13,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from fdi_gym import diagnosis, evaluation, leaderboard, row, suite, verification
+from fdi_gym import evaluation, leaderboard, row, suite, verification
 from fdi_gym import plant as plant_module
-from fdi_gym.diagnosis import diagnosers
+from fdi_gym.diagnosis import diagnosers, registry
 from fdi_gym.evaluation import applicable, digests_of, evaluate, settings_of
 from fdi_gym.files import RefusedError, compress, digest, pretty, sweep, write_whole
 from fdi_gym.metrics import Outcome, summarise
@@ -479,7 +479,7 @@ def test_settings_in_a_row_are_what_the_builder_got(monkeypatch):
         got.update(settings)
         return entry.build(plant, **settings)
 
-    monkeypatch.setitem(diagnosis._entries, "three_stage_cdkf", entry._replace(build=build))
+    monkeypatch.setitem(registry._entries, "three_stage_cdkf", entry._replace(build=build))
     plant = frozen.build()
     applicable(frozen, plant, ["three_stage_cdkf"])
     assert got

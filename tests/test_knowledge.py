@@ -1,0 +1,135 @@
+"""What methods know of a plant is shipped for the shipped suites: building flies nothing, fitting gives the same again."""
+
+import json
+
+import numpy as np
+import pytest
+from conftest import PLANTS, ROOT, build
+
+from fdi_gym.diagnosis import NotApplicableError, diagnosers, find_diagnoser, fitting, knowledge, make_diagnoser
+from fdi_gym.diagnosis.knowledge import Fits, fits_file, write_fits
+from fdi_gym.estimation.calibration import Calibration
+from fdi_gym.estimation.data import digest
+from fdi_gym.suite import load_suite, suite_names
+
+SUITES = suite_names()
+
+
+def shipped(plant_id):
+    return fits_file(ROOT / "baselines", plant_id)
+
+
+@pytest.mark.parametrize("plant_id", PLANTS)
+def test_shipped_fits_are_of_the_code_that_is_here(plant_id):
+    fits = shipped(plant_id)
+    assert fits is not None
+    assert fits.plant == plant_id
+    assert fits.code == knowledge.code_digest(build(plant_id)), f"the plant's code changed: fdi-gym fit {plant_id}"
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_building_on_a_shipped_suite_flies_nothing(monkeypatch, name):
+    """Every diagnoser, with the settings that the suite gives it: what it knows is shipped, or it says why it cannot run."""
+
+    def fly(*_, **__):
+        raise AssertionError("a flight")
+
+    monkeypatch.setattr(knowledge, "_kept", {})
+    monkeypatch.setattr(knowledge, "fit_belief", fly)
+    monkeypatch.setattr(knowledge, "fit_calibration", fly)
+    suite = load_suite(name)
+    plant = suite.build()
+    scenarios, built = suite.scenarios(plant, [0]), 0
+    for method, entry in diagnosers().items():
+        settings = suite.settings.get(method, {})
+        try:
+            make_diagnoser(method, plant, process=suite.process, scenarios=scenarios, **settings)
+            built += entry.takes("calibration")
+        except NotApplicableError:
+            continue
+    assert built >= 10
+
+
+@pytest.mark.parametrize("plant_id", PLANTS)
+def test_methods_get_what_is_shipped_for_them(plant_id):
+    """Not another method's, process's or plant's."""
+    plant, fits = build(plant_id), shipped(plant_id)
+    for process in ("standard", "hard"):
+        if knowledge.belief_key(plant, process) not in fits.beliefs:
+            continue  # a process that suites fly with other options only
+        for name in ("augmented_ekf", "augmented_ukf", "glr_ekf"):
+            entry = find_diagnoser(name)
+            given = knowledge.knowledge_of(entry, plant, process, entry.resolve(plant))
+            assert digest(given["belief"]) == digest(fits.beliefs[knowledge.belief_key(plant, process)])
+            key = knowledge.calibration_key(entry, plant, process, entry.resolve(plant))
+            assert json.loads(key)[:2] == [name, process]
+            assert digest(given["calibration"]) == digest(fits.calibrations[key])
+
+
+def test_an_edited_plant_or_a_damaged_file_is_not_answered_by_old_fits(monkeypatch, tmp_path, b747):
+    entry = find_diagnoser("augmented_ekf")
+    made = Calibration(thresholds={mode.name: 1.0 for mode in b747.modes})
+    monkeypatch.setattr(knowledge, "_kept", {})
+    monkeypatch.setattr(knowledge, "package_of", lambda entry: tmp_path)
+    monkeypatch.setattr(knowledge, "cache_folder", lambda source: None)
+    key = knowledge.calibration_key(entry, b747, "standard", {})
+    path = tmp_path / "fits" / f"{b747.id}.json"
+
+    def ask():
+        knowledge.fits_file.cache_clear()
+        knowledge._kept.clear()
+        return knowledge._known(entry, b747, "calibrations", key, lambda: Calibration())
+
+    write_fits(path, Fits(plant=b747.id, code=knowledge.code_digest(b747), calibrations={key: made}))
+    assert digest(ask()) == digest(made)
+    whole = path.read_bytes()
+    for damaged in (whole[:50], b"", b"[]", whole.replace(b"beliefs", b"believes"), b"\xff" * 10):
+        path.write_bytes(damaged)
+        assert digest(ask()) == digest(Calibration())
+    path.write_bytes(whole)
+    assert digest(ask()) == digest(made)
+    monkeypatch.setattr(knowledge, "code_digest", lambda plant: "edited")
+    assert digest(ask()) == digest(Calibration())
+    knowledge.fits_file.cache_clear()
+
+
+def test_docstrings_and_comments_do_not_make_another_plant(tmp_path):
+    text = '"""A plant."""\nX = 1.0  # unit\n\n\ndef f(x):\n    """It."""\n    return x + X\n'
+    digests = []
+    for i, version in enumerate(
+        (text, text.replace("A plant", "The plant").replace("  # unit", ""), text.replace("1.0", "1.1"))
+    ):
+        path = tmp_path / f"{i}.py"
+        path.write_text(version)
+        digests.append(knowledge._code_digest(path))
+    assert digests[0] == digests[1] != digests[2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plant_id", PLANTS)
+def test_fitting_again_gives_the_same_bytes(plant_id):
+    """Beliefs of all suites, and the calibrations of two quick methods."""
+    fits, suites = shipped(plant_id), [suite for suite in map(load_suite, SUITES) if suite.plant == plant_id]
+    entries = [find_diagnoser(name) for name in ("augmented_ekf", "two_stage_ekf")]
+    (again,) = knowledge.fit_suites(entries, suites).values()
+    assert again.code == fits.code
+    for kind in ("beliefs", "calibrations"):
+        found = getattr(again, kind)
+        assert found
+        for key, value in found.items():
+            assert digest(value) == digest(getattr(fits, kind)[key]), key
+
+
+def test_a_belief_is_near_what_the_data_sheet_declares():
+    """Process and sensor noise of the shipped beliefs are at least the declared ones, and walks reach the faults' sizes."""
+    for plant_id in PLANTS:
+        for key, belief in shipped(plant_id).beliefs.items():
+            assert (np.linalg.eigvalsh(belief.Q) > -1e-12 * np.trace(belief.Q)).all(), key
+            assert (belief.z_walk > 0).all()
+            assert (belief.z_walk < 10 * belief.z_size).all(), key
+            assert 0 <= belief.changes < 0.1
+
+
+def test_flights_of_a_fit_are_validation_flights():
+    assert fitting.VALIDATION_SEED == 2_000_000
+    assert fitting.VALIDATION_SEED + fitting.FIRST + 100 < 3_000_000
