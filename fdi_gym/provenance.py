@@ -22,6 +22,7 @@ import platformdirs
 
 from fdi_gym.diagnosis import diagnosers, find_diagnoser, make_diagnoser
 from fdi_gym.diagnosis.knowledge import knowledge_of
+from fdi_gym.diagnosis.registry import package_of
 from fdi_gym.engine import simulate
 from fdi_gym.estimation.data import digest
 from fdi_gym.faults import draw
@@ -60,7 +61,9 @@ def provenance(name: str, plant: Plant, process: str, settings: Mapping[str, Any
     read = _while_running(key, lambda: _use(name, plant, process, settings))
     own = {**method, **declared}
     read |= {path for file in own.values() for path in _at_import.get(str(file), ())}
-    data = {path for path in read if _is_data(path, own)}
+    home = package_of(entry)
+    known = () if home is None else (home / "fits", home / "tuning")  # which the digests of knowledge and settings cover
+    data = {path for path in read if _is_data(path, own) and path.parent not in known}
     found = {"method": _digest(method), "plant": _digest(declared), "engine": _digest(engine)}
     found |= {kind: digest(what) for kind, what in knowledge_of(entry, plant, process, settings).items()}
     return found | ({"data": _digest({str(p): p for p in data}, by_name=False)} if data else {})
@@ -217,6 +220,8 @@ def _is_data(path: Path, modules: Mapping[str, Path]) -> bool:
     path = path.resolve()
     cache = Path(os.environ.get("FDI_GYM_CACHE_DIR") or platformdirs.user_cache_path("fdi_gym")).resolve()
     if not path.is_file() or any(path.is_relative_to(folder) for folder in (*_SYSTEM, cache)):
+        return False
+    if path.parent.suffix in (".dist-info", ".egg-info"):  # an installed package's description
         return False
     packages = [file.parent for file in modules.values() if file.stem == "__init__"]
     return not _is_library(path) or any(path.is_relative_to(folder) for folder in packages)

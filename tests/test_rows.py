@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import socket
+import subprocess
 import sys
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import pytest
 from fdi_gym import evaluation, leaderboard, row, suite, verification
 from fdi_gym import plant as plant_module
 from fdi_gym.diagnosis import diagnosers, registry
+from fdi_gym.estimation import data
 from fdi_gym.evaluation import applicable, digests_of, evaluate, settings_of
 from fdi_gym.files import RefusedError, compress, digest, pretty, sweep, write_whole
 from fdi_gym.metrics import Outcome, summarise
@@ -482,8 +484,25 @@ def test_settings_in_a_row_are_what_the_builder_got(monkeypatch):
     monkeypatch.setitem(registry._entries, "three_stage_cdkf", entry._replace(build=build))
     plant = frozen.build()
     applicable(frozen, plant, ["three_stage_cdkf"])
+    knowledge = {name: data.digest(got.pop(name)) for name in ("belief", "calibration")}
     assert got
     assert json.loads(json.dumps(got)) == settings_of(frozen, plant, "three_stage_cdkf")
+    assert knowledge.items() <= digests_of(frozen, plant, "three_stage_cdkf").items()
+
+
+@pytest.mark.parametrize("name", ["three_stage_cdkf", "sequence_net"])
+def test_digests_do_not_depend_on_what_was_loaded_before(name):
+    code = (
+        "import sys, json; from fdi_gym.diagnosis import make_diagnoser; from fdi_gym.evaluation import digests_of; "
+        "from fdi_gym.suite import load_suite; frozen = load_suite('huav-standard'); plant = frozen.build(); "
+        "first = sys.argv[1:] and make_diagnoser(sys.argv[1], plant, process='standard'); "
+        f"print(json.dumps(digests_of(frozen, plant, {name!r})))"
+    )
+    found = [
+        json.loads(subprocess.run([sys.executable, "-c", code, *first], capture_output=True, text=True, check=True).stdout)
+        for first in ([], ["augmented_ekf"], [name])
+    ]
+    assert found[0] == found[1] == found[2]
 
 
 # -- what is committed

@@ -11,7 +11,8 @@ dynamics (I - L H) A are stable: no unstable invariant zero.
 
 A sample that lacks sensors without which the inputs are not told apart is no sample of this filter: the interval goes on,
 and the next whole sample solves for the inputs that acted over all of it, taken as constant. Until then the state is
-predicted without unknown inputs, and the inputs' last estimates stand.
+predicted without unknown inputs, and the inputs' last estimates stand. An interval over which a command did not report
+is used like any other, but it is no evidence of a fault: what the command changed is an unknown input, too.
 
 After Z. Nejati et al., Int. J. Engineering, Transactions B 34(5), 2021, Table 2, derived anew where it is unreadable.
 """
@@ -51,6 +52,7 @@ class RobustThreeStage(NamedTuple):
     E: Array  # (n, n_x, q)
     seen: Array  # (n,) sensors that were used at the last sample
     span: Array  # (n,) samples that the current interval spans
+    held: Array  # (n,) bool: somewhere in it a command did not report
 
 
 def start(n: int, x0: Array, P0: Array, cov_b: Array, cov_d: Array) -> RobustThreeStage:
@@ -59,7 +61,7 @@ def start(n: int, x0: Array, P0: Array, cov_b: Array, cov_d: Array) -> RobustThr
     return RobustThreeStage(
         np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1)), np.zeros((n, p)), np.zeros((n, q)),
         np.tile(cov_b, (n, 1, 1)), np.tile(cov_d, (n, 1, 1)), np.zeros((n, n_x, p)), np.zeros((n, n_x, q)),
-        np.zeros(n, np.int64), np.zeros(n, np.int64),
+        np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n, bool),
     )  # fmt: skip
 
 
@@ -104,7 +106,7 @@ def solved(s: RobustThreeStage, y: Array, seen: Array, H: Array, R: Array) -> Ro
     P = symmetric(Pxb + V12 @ Pb @ T(V12) + V13 @ Pd @ T(V13))
     return RobustThreeStage(
         x, P, b + times(V23, d), d, symmetric(Pb + V23 @ Pd @ T(V23)), Pd, np.zeros_like(s.B), np.zeros_like(s.E),
-        seen.sum(axis=1), s.span,
+        seen.sum(axis=1), s.span, s.held,
     )  # fmt: skip
 
 
@@ -231,13 +233,17 @@ def robust_three_stage_filter(plant: Plant, known: Known, rule: str) -> Filter:
     def ahead(s: RobustThreeStage, at: Interval) -> RobustThreeStage:
         none = np.zeros((len(s.x), p)), np.zeros((len(s.x), q))
         after = predict(s, propagate((at.k - 1) * plant.dt, s.x, s.P, at.u, *none), known.Q)
-        return after if at.stale is None else after._replace(P=plus_held_commands(plant, after.P, s.x, at))
+        held = s.held & (s.seen == 0)  # the interval goes on
+        if at.stale is None:
+            return after._replace(held=held)
+        return after._replace(P=plus_held_commands(plant, after.P, s.x, at), held=held | (at.stale > 0).any(axis=1))
 
     def measured(s: RobustThreeStage, at: Interval, y: Array, seen: Array) -> RobustThreeStage:
         return update(s, y[:, known.sensors], seen[:, known.sensors], known.H, known.R)
 
     def read(s: RobustThreeStage) -> Reading:
-        return Reading(s.b, s.cov_b, s.x, s.P, seen=s.seen, span=np.minimum(s.span, LONGEST), signals={"disturbance": s.d})
+        seen = np.where(s.held, 0, s.seen)  # the inputs over the interval contain what the command changed
+        return Reading(s.b, s.cov_b, s.x, s.P, seen=seen, span=np.minimum(s.span, LONGEST), signals={"disturbance": s.d})
 
     return Filter(lambda n: start(n, known.x0, known.P0, cov_b, cov_d), ahead, measured, read, first_sample=False)
 

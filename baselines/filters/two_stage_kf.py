@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
+from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser, diagnoser_of
 from fdi_gym.estimation.augmented import Interval, plus_held_commands
 from fdi_gym.estimation.calibration import Persistence, uniform
 from fdi_gym.estimation.decision import Reading, Rule, by_candidate, by_labels
@@ -188,11 +188,14 @@ def decision_rule(
     """The decision by name; with labels of simultaneous faults the threshold is a penalty per fault.
 
     Raises:
-        ValueError: Unknown name, or fixed thresholds without positions.
+        NotApplicableError: Fixed thresholds, and no positions for the plant's surfaces.
+        ValueError: Unknown name.
     """
     if decision == "thresholds":
         if not position:
-            raise ValueError(f"the decision 'thresholds' needs a position threshold for each surface of {plant.id}")
+            raise NotApplicableError(
+                f"fixed thresholds need the position of each surface that is stuck; {plant.id} has none"
+            )
         return by_candidate(surface_candidate(plant, position), 20, WARMUP)
     if decision != "distance":
         raise ValueError(f"unknown decision {decision!r}; there are distance, thresholds")
@@ -245,9 +248,8 @@ def two_stage_kf(
         structured: Report the magnitude of the declared fault in place of the free estimate.
 
     Raises:
-        NotApplicableError: The plant is nonlinear.
+        NotApplicableError: The plant is nonlinear, or fixed thresholds have no positions.
         ValueError: Unknown forgetting rule or decision.
     """
-    aged = aging(plant, q_bias, forgetting, factor, a_min, a_max)
-    rule = decision_rule(plant, decision, threshold, release_after, position, structured)
-    return diagnoser_of(plant, two_stage_filter(plant, aged), rule)
+    filter = two_stage_filter(plant, aging(plant, q_bias, forgetting, factor, a_min, a_max))
+    return diagnoser_of(plant, filter, decision_rule(plant, decision, threshold, release_after, position, structured))

@@ -92,4 +92,5 @@ def told_onset_ekf(plant: Plant, belief: Belief, *, scenarios: Sequence[FaultSce
         return r._replace(z=np.where(acts, r.z, 0.0), P=np.where(acts[..., None], r.P, 0.0), cost=cost)
 
     rule = by_candidate(lambda r, label: np.argmin(np.asarray(r.cost), axis=1), 1)
-    return diagnoser_of(plant, Filter(start, predict, update, read), rule)
+    filter = Filter(start, predict, update, read, expect=lambda s, at: model.expect(s.filter.X[:, model.x], at))
+    return diagnoser_of(plant, filter, rule)

@@ -36,6 +36,13 @@ accuracy per sample in percent, with a 95 % bootstrap interval over the episodes
 that the code gives, or not run yet, both below. Methods marked * know the truth. General methods need nothing but the
 plant's declaration.
 """
+CONSISTENCY = """## Consistency
+
+Healthy flights. Mean per dimension (1 where the filter is as sure of itself as it may be), and the share of samples on
+which the mean over 40 flights lies within its 95 % bounds. A filter that expects faults to walk in at any time is
+conservative on flights that have none: that is the price of seeing them.
+
+"""
 
 
 @dataclasses.dataclass
@@ -175,12 +182,8 @@ def page(results: Path, figures: dict[str, Any]) -> str:
     if absent := missing(results, figures):
         parts.append("## Not run yet\n\n" + "\n".join(f"- {suite}: {', '.join(names)}" for suite, names in absent.items()))
     parts.append("## Not applicable\n\n" + reasons_table(figures.get("reasons", {})))
-    parts.append(
-        "## Consistency\n\nHealthy flights. Mean per dimension (1 where the filter is as sure of itself as it may be), and "
-        "the share of samples on which the mean over 40 flights lies within its 95 % bounds. A filter that expects faults "
-        "to walk in at any time is conservative on flights that have none: that is the price of seeing them.\n\n"
-        + consistency_table(figures.get("consistency", {}))
-    )
+    if measured := figures.get("consistency"):
+        parts.append(CONSISTENCY + consistency_table(measured))
     return "\n\n".join(parts) + "\n"
 
 

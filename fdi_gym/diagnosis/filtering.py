@@ -94,7 +94,7 @@ def _step(plant: Plant, filter: Filter, rule: Rule, s: Running, obs: Array) -> t
     elif measures.any():
         state = choose(measures, filter.update(state, at, y, seen), state)
     reading = filter.read(state)
-    informed = measures if whole else measures & (seen.any(axis=1) if reading.seen is None else reading.seen > 0)
+    informed = measures & (seen.any(axis=1) if reading.seen is None else reading.seen > 0)
     ruled, verdict = rule.step(s.rule, s.k, reading, informed)
     return Running(s.k + 1, begun, u, stale, known, state, ruled), reading, verdict
 
