@@ -54,7 +54,7 @@ def test_made_by_id_in_both_forms(plant_id):
 
 @pytest.mark.parametrize("plant_id", PLANTS)
 @pytest.mark.parametrize("name", list(diagnosers()))
-def test_diagnoser(short_calibrations, plant_id, name):
+def test_diagnoser(plant_id, name):
     entry = diagnosers()[name]
 
     def make(plant, scenarios):

@@ -115,7 +115,7 @@ def at_samples(answers: Array, period: int, samples: int) -> Array:
 
 
 def word(plant: Plant, said: Diagnosis) -> Array:
-    """A filter's diagnosis as features (n, ...): its label, probabilities, estimate and spread, and its own signals."""
+    """A filter's diagnosis as features (n, ...): its label, probabilities, estimate and spread."""
     labels = len(plant.labels)
     found = [np.eye(labels + 1)[said.label]]  # the last column is a lost filter's -1
     if said.label_probs is not None:
@@ -125,7 +125,6 @@ def word(plant: Plant, said: Diagnosis) -> Array:
     if said.estimate_std is not None:
         found.append(np.log(np.maximum(ident.deviation(plant, said.estimate_std + plant.estimate_target(
             plant.nominal_theta, plant.trim_command)), 1e-4)) / 2)  # fmt: skip
-    found += [np.arcsinh(np.reshape(value, (len(said.label), -1))) for value in (said.signals or {}).values()]
     return np.nan_to_num(np.concatenate(found, axis=1), nan=0.0, posinf=0.0, neginf=0.0)
 
 
@@ -141,14 +140,13 @@ def _elsewhere(known: PlantSource, plant_id: str, *arguments: Any) -> list[Array
 
 
 def _words(plant: Plant, source: Source, name: str, obs: Array, period: int) -> Array:
-    said = run(make_diagnoser(name, plant, process=source.process), obs, signals=True)
+    said = run(make_diagnoser(name, plant, process=source.process), obs)
     parts = [getattr(said, name) for name in ("alarm", "label", "estimate", "estimate_std", "label_probs")]
     n, samples = said.label.shape
     steps = samples // period
     every = slice(period - 1, steps * period, period)
     flat = [None if a is None else a[:, every].reshape(n * steps, *a.shape[2:]) for a in parts]
-    signals = {name: a[:, every].reshape(n * steps, -1) for name, a in (said.signals or {}).items()}
-    answer = Diagnosis(*flat, signals=signals or None)  # type: ignore[arg-type]
+    answer = Diagnosis(*flat)  # type: ignore[arg-type]
     return word(plant, answer).reshape(n, steps, -1).astype(np.float32)
 
 

@@ -94,7 +94,9 @@ def run(diagnoser: Diagnoser, obs: Array, signals: bool = False) -> Decisions:
 
 
 def map_arrays(function: Callable[..., Any], *nests: Any) -> Any:
-    """Apply to the arrays of equal nests; other leaves are those of the first."""
+    """Apply to the arrays of equal nests; other leaves are those of the first, and None gives way to what is there."""
+    if any(nest is None for nest in nests):
+        return next((nest for nest in nests if nest is not None), None)
     first = nests[0]
     if isinstance(first, np.ndarray):
         return function(*nests)
