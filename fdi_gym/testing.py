@@ -374,10 +374,9 @@ def _check_gaps(diagnoser: Diagnoser, plant: Plant, scenarios: Sequence[FaultSce
     truth = np.stack([plant.label_rows(s)[: obs.shape[1]] for s in scenarios])
     right, right_hurt = ((d.label == truth).mean() for d in (said, hurt))
     assert right_hurt >= right - 0.15, f"gaps cost accuracy: {right:.2f} without, {right_hurt:.2f} with"
-    alarms, alarms_hurt = ((d.alarm & (truth == 0)).mean() for d in (said, hurt))
-    assert alarms_hurt <= alarms + 0.05, (
-        f"gaps raise false alarms: {alarms:.3f} of the samples without, {alarms_hurt:.3f} with"
-    )
+    alarms, alarms_hurt = ((d.alarm & (truth == 0)).any(axis=1).sum() for d in (said, hurt))
+    # at the calibrated rate of 5 %, two of four flights alarm by chance once in 71 times
+    assert alarms_hurt <= alarms + 1, f"gaps raise false alarms: in {alarms} flights without, in {alarms_hurt} with"
 
 
 def _arrays(said: Decisions) -> dict[str, Array]:

@@ -95,6 +95,8 @@ def _step(plant: Plant, filter: Filter, rule: Rule, s: Running, obs: Array) -> t
         state = choose(measures, filter.update(state, at, y, seen), state)
     reading = filter.read(state)
     informed = measures & (seen.any(axis=1) if reading.seen is None else reading.seen > 0)
+    if at.stale is not None:  # what a command that did not report has changed is no evidence of a fault
+        informed &= (at.stale == 0).all(axis=1)
     ruled, verdict = rule.step(s.rule, s.k, reading, informed)
     return Running(s.k + 1, begun, u, stale, known, state, ruled), reading, verdict
 
