@@ -5,7 +5,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import PLANTS, build
+from conftest import PLANTS, SHIPPED, build
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
@@ -60,6 +60,8 @@ NOT_QUIET_AFTER_GAPS = {("HUAVHover", name) for name in ("three_stage_cdkf", "th
 @pytest.mark.parametrize("plant_id", PLANTS)
 @pytest.mark.parametrize("name", list(diagnosers()))
 def test_diagnoser(plant_id, name, request):
+    if plant_id not in SHIPPED:
+        request.getfixturevalue("short_calibrations")
     if (plant_id, name) in NOT_QUIET_AFTER_GAPS:
         request.applymarker(pytest.mark.xfail(strict=True, raises=AssertionError))
     entry = diagnosers()[name]
