@@ -96,11 +96,6 @@ def write_whole(path: Path, content: bytes) -> None:
             part.unlink()  # there only after an error or an interruption
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write a value as indented JSON, whole."""
-    write_whole(path, pretty(value))
-
-
 def pretty(value: Any) -> bytes:
     """A value as indented JSON, the one way in which files of ours are written."""
     return msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n"

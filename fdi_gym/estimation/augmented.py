@@ -17,11 +17,11 @@ import scipy.linalg
 
 from fdi_gym.estimation import gaussian
 from fdi_gym.estimation.belief import Belief, FaultInputs, fault_inputs
+from fdi_gym.estimation.gaussian_model import STEP
 from fdi_gym.estimation.kalman import T
 from fdi_gym.plant import Array, Plant
 
 HELD = 10  # samples within which a command that is held goes wrong by its typical size
-STEP = 1e-3  # of the central differences, in units of the signals' scales
 WIDEST = 2.0  # the walk never makes a fault's standard deviation larger than this, in units of its typical size
 
 
