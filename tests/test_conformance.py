@@ -52,11 +52,8 @@ def test_made_by_id_in_both_forms(plant_id):
     assert np.array_equal(first, both[0])
 
 
-# On the helicopter: after a gap in everything the filters' estimates are as uncertain as they should be, but their fixed
-# thresholds on smoothed channels, which were calibrated on whole flights, do not know it: 5 of 16 healthy flights alarm.
-# On the satellite: a fifth of the accuracy is lost.
-HURT_BY_GAPS = {("HUAVHover", name) for name in ("three_stage_cdkf", "three_stage_ekf", "ascdkf")}
-HURT_BY_GAPS |= {("CMGSatellite", "ascdkf")}
+# On the satellite a fifth of the accuracy is lost.
+HURT_BY_GAPS = {("CMGSatellite", "ascdkf")}
 
 
 @pytest.mark.parametrize("plant_id", PLANTS)

@@ -514,14 +514,15 @@ def test_filters_run_on_another_plant_with_a_gust(name):
 # -- channels
 
 
-def switched(plant, values, alpha=1.0):
-    """Whether one channel with threshold 1 is on after each of these estimates."""
+def switched(plant, values, alpha=1.0, stds=None):
+    """Whether one channel with threshold 1 is on after each of these estimates, with these deviations (default: 1)."""
     rule, found = by_channels(plant, fault_inputs(plant, ("lon",)), alpha, np.ones(1)), ""
     state = rule.start(1)
     for k, value in enumerate(values):
         z = np.zeros((1, 4))
         z[0, 1] = 0.0 if value is None else value
-        state, said = rule.step(state, np.array([k]), Reading(z), np.array([value is not None]))
+        P = (1.0 if stds is None else stds[k]) ** 2 * np.eye(4)[None]
+        state, said = rule.step(state, np.array([k]), Reading(z, P), np.array([value is not None]))
         assert said.alarm[0] == (plant.labels[said.label[0]].name == "lon")
         found += ".F"[int(said.alarm[0])]
     return found, said
@@ -539,11 +540,23 @@ def test_channel_waits_where_nothing_is_said(plant):
     assert switched(plant, [2] * 3 + [0.4] * 19 + [None] * 30 + [0.4])[0] == ".." + "F" * 50 + "."
 
 
+def test_channel_asks_for_more_while_an_estimate_has_not_got_over_a_gap(plant):
+    gap, low = [None] * 2, [0.1] * 3
+    stds = [1.0] * 3 + [3.0] * 2
+    assert switched(plant, low + gap + [2] * 6, stds=stds + [3.0] * 6)[0] == "." * 11  # 2 is within 3 times the threshold
+    assert switched(plant, low + gap + [4] * 6, stds=stds + [3.0] * 6)[0] == "." * 7 + "FFFF"
+    assert switched(plant, low + gap + [2] * 6, stds=stds + [3.0, 2.5, 1.09, 1, 1, 1])[0] == "." * 9 + "FF"
+    assert switched(plant, low + [2] * 6, stds=[1.0] * 3 + [3.0] * 6)[0] == "." * 5 + "FFFF"  # there was no gap
+    on = [2] * 3 + gap + [0.6] * 30
+    assert switched(plant, on, stds=[1.0] * 3 + [9.0] * 32)[0] == ".." + "F" * 33  # what is on does not go off for it
+    assert switched(plant, low + gap + [2] * 20, stds=stds + [3.0] * 20)[0] == "." * 17 + "F" * 8  # 3 is the usual by then
+
+
 def test_smoothing_starts_at_zero_and_goes_on_for_the_samples_that_an_estimate_spans(plant):
     _, said = switched(plant, [1, 1], 0.2)
     assert said.signals["smoothed"][0] == pytest.approx(0.36)
     rule = by_channels(plant, fault_inputs(plant, ("lon",)), 0.2, np.ones(1))
-    _, said = rule.step(rule.start(1), np.array([2]), Reading(np.ones((1, 4)), span=np.array([2])), np.array([True]))
+    _, said = rule.step(rule.start(1), np.array([2]), Reading(np.ones((1, 4)), np.eye(4)[None], span=np.array([2])), np.array([True]))
     assert said.signals["smoothed"][0] == pytest.approx(0.36)
 
 

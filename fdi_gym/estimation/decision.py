@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi_gym.estimation.automaton import Automaton, first, step
-from fdi_gym.estimation.belief import FaultInputs
+from fdi_gym.estimation.belief import FaultInputs, noisy_sensors
 from fdi_gym.estimation.calibration import LEAST, Calibration, Persistence, gain
 from fdi_gym.estimation.kalman import quadratic
 from fdi_gym.estimation.labels import channel_sets, distances, label_of_channels, manifolds
@@ -250,12 +250,25 @@ def by_candidate(candidate: Callable[[Reading, Array], Array], after: int, warmu
 
 
 CHANNELS = Persistence(3, 1, 20)
+RECOVERED = 1.1  # estimates have got over a gap when their deviations are at most by this factor what they were before it
+FORGOTTEN = 10  # or after whole samples for so many time constants of the smoothing: then what they were is history
+
+
+class Smoothed(NamedTuple):
+    """State of `by_channels`: n episodes, p channels."""
+
+    value: Array  # (n, p) smoothed estimates
+    std: Array  # (n, p) their standard deviation, smoothed alike: errors of neighbouring samples are nearly the same
+    usual: Array  # (n, p) what that was before the gap; 0 before there are estimates
+    whole: Array  # (n, 1) whole samples since the last gap; without bound where the estimates have got over it
+    declared: Automaton
 
 
 def by_channels(plant: Plant, inputs: FaultInputs, alpha: float, thresholds: Array, after: Persistence = CHANNELS) -> Rule:
     """Each entry of the fault vector, smoothed: s+ = (1 - alpha) s + alpha z; on above its threshold, off below half of it.
 
-    The label is the set of entries that are on.
+    The label is the set of entries that are on. After a gap the estimates are less certain for a while, by their own
+    covariance; the threshold that turns a channel on is higher by the same factor until they are what they were.
 
     Args:
         plant: The plant.
@@ -271,22 +284,33 @@ def by_channels(plant: Plant, inputs: FaultInputs, alpha: float, thresholds: Arr
     if J.shape != (len(inputs.names),):
         raise ValueError(f"one threshold per channel ({', '.join(inputs.names)}) is needed, not {np.asarray(J).tolist()}")
     labels, sets = channel_sets(plant, inputs)
+    every = len(noisy_sensors(plant))
 
-    def start(n: int) -> Any:
-        return np.zeros((n, len(J))), undeclared((n, len(J)))
+    def start(n: int) -> Smoothed:
+        nothing = np.zeros((n, len(J)))
+        return Smoothed(nothing, nothing, nothing, np.full((n, 1), np.inf), undeclared((n, len(J))))
 
-    def step(state: Any, k: Array, r: Reading, informed: Array) -> tuple[Any, Verdict]:
-        smooth, declared = state
+    def step(s: Smoothed, k: Array, r: Reading, informed: Array) -> tuple[Smoothed, Verdict]:
         assert r.z is not None
+        assert r.P is not None
         informed = (informed & (k > after.warmup))[:, None]
         kept = 1 - alpha if r.span is None else ((1 - alpha) ** r.span)[:, None]
-        smooth = np.where(informed, kept * smooth + (1 - kept) * r.z[:, inputs.estimated], smooth)
-        size = np.abs(smooth)
+        std = np.sqrt(np.maximum(np.einsum("npp->np", r.P)[:, inputs.estimated], 0.0))
+        value = np.where(informed, kept * s.value + (1 - kept) * r.z[:, inputs.estimated], s.value)
+        spread = np.where(informed, np.where(s.std > 0, kept * s.std + (1 - kept) * std, std), s.std)
+        missing = ~informed if r.seen is None else ~informed | (r.seen < every)[:, None]
+        whole = np.where(missing, 0.0, s.whole + 1.0)
+        over = ~missing & (spread <= RECOVERED * s.usual).all(axis=1, keepdims=True) | (whole * alpha > FORGOTTEN)
+        whole = np.where(over | (s.usual == 0).all(axis=1, keepdims=True), np.inf, whole)
+        usual = np.where(np.isinf(whole), spread, s.usual)
+        factor = np.maximum(spread / np.where(usual > 0, usual, 1.0), 1.0)
+        size = np.abs(value)
         on = np.ones(size.shape, np.int64)
-        declared = declare(declared, on, size > J, size < 0.5 * J, after, np.broadcast_to(informed, size.shape))
+        declared = declare(s.declared, on, size > factor * J, size < 0.5 * J, after, np.broadcast_to(informed, size.shape))
         flagged = declared.label > 0
         label = label_of_channels(labels, sets, flagged, size / J)
-        signals = {"smoothed": smooth, "channels_on": flagged}
-        return (smooth, declared), Verdict(np.any(flagged, axis=1), label, evidence=Evidence(channels=size), signals=signals)
+        signals = {"smoothed": value, "channels_on": flagged}
+        verdict = Verdict(np.any(flagged, axis=1), label, evidence=Evidence(channels=size), signals=signals)
+        return Smoothed(value, spread, usual, whole, declared), verdict
 
     return Rule(start, step)
