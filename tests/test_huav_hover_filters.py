@@ -545,7 +545,7 @@ def test_channel_asks_for_more_while_an_estimate_has_not_got_over_a_gap(plant):
     stds = [1.0] * 3 + [3.0] * 2
     assert switched(plant, low + gap + [2] * 6, stds=stds + [3.0] * 6)[0] == "." * 11  # 2 is within 3 times the threshold
     assert switched(plant, low + gap + [4] * 6, stds=stds + [3.0] * 6)[0] == "." * 7 + "FFFF"
-    assert switched(plant, low + gap + [2] * 6, stds=stds + [3.0, 2.5, 1.09, 1, 1, 1])[0] == "." * 9 + "FF"
+    assert switched(plant, low + gap + [2] * 6, stds=[*stds, 3.0, 2.5, 1.09, 1, 1, 1])[0] == "." * 9 + "FF"
     assert switched(plant, low + [2] * 6, stds=[1.0] * 3 + [3.0] * 6)[0] == "." * 5 + "FFFF"  # there was no gap
     on = [2] * 3 + gap + [0.6] * 30
     assert switched(plant, on, stds=[1.0] * 3 + [9.0] * 32)[0] == ".." + "F" * 33  # what is on does not go off for it
@@ -556,7 +556,9 @@ def test_smoothing_starts_at_zero_and_goes_on_for_the_samples_that_an_estimate_s
     _, said = switched(plant, [1, 1], 0.2)
     assert said.signals["smoothed"][0] == pytest.approx(0.36)
     rule = by_channels(plant, fault_inputs(plant, ("lon",)), 0.2, np.ones(1))
-    _, said = rule.step(rule.start(1), np.array([2]), Reading(np.ones((1, 4)), np.eye(4)[None], span=np.array([2])), np.array([True]))
+    _, said = rule.step(
+        rule.start(1), np.array([2]), Reading(np.ones((1, 4)), np.eye(4)[None], span=np.array([2])), np.array([True])
+    )
     assert said.signals["smoothed"][0] == pytest.approx(0.36)
 
 

@@ -1,0 +1,181 @@
+"""A whole scenario as a diagnosis: which faults a flight had, when they began and ended, and how large they were.
+
+One declaration is made at the end of a flight: a row for each fault mode of the plant. `true_declaration` makes it of the
+truth, `declared` of what any diagnoser said over the flight, `errors` compares the two and `worth` makes one number of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from fdi_gym.diagnosis.contract import Decisions
+from fdi_gym.engine import Record
+from fdi_gym.plant import Array, Plant
+
+PRESENT, ONSET, END, SIZE, COLUMNS = range(5)  # of a declaration's rows
+BRIDGED = 20  # samples without an alarm that do not end it, as of an intermittent fault
+SHORTEST = 10  # samples that an alarm must last to be declared
+SHARE, LASTING = 0.5, 0.05  # a mode is declared that so much of its alarm, or of the flight, names
+
+
+class Errors(NamedTuple):
+    """What is wrong with declarations of n flights; NaN where a mode is not both true and declared."""
+
+    exact: Array  # (n,) bool: the set of modes is the true one
+    onset: Array  # (n, modes) declared less true onset, in samples
+    overlap: Array  # (n, modes) intersection over union of the declared and the true window
+    size: Array  # (n, modes) declared less true size
+
+
+def spans(plant: Plant) -> Array:
+    """The length of each mode's reach (modes,): what an error of its size is compared with."""
+    return np.array([mode.reach[1] - mode.reach[0] for mode in plant.modes])
+
+
+def sizes(plant: Plant, active: Sequence[int], deviation: Array) -> Array:
+    """The magnitude of each of the active modes (..., f) from the estimated quantity's deviation from healthy (..., n).
+
+    Where the lines of the modes share a direction, the least magnitudes that explain it.
+    """
+    offset = np.sum([plant.modes[i].offset for i in active], axis=0)
+    D = np.transpose([plant.modes[i].direction for i in active])
+    low, high = np.transpose([plant.modes[i].reach for i in active])
+    return np.clip((deviation - offset) @ np.linalg.pinv(D).T, low, high)
+
+
+def _settled(values: Array) -> float:
+    """The median over the second half of a fault's window, when it has built up."""
+    values = values[len(values) // 2 :]
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if values.size else np.nan
+
+
+def _deviation(plant: Plant, estimate: Array) -> Array:
+    return estimate - plant.estimate_target(plant.nominal_theta, plant.trim_command)
+
+
+def _windows_to_rows(
+    plant: Plant, windows: dict[int, list[tuple[int, int]]], label: Array, deviation: Array | None
+) -> Array:
+    """The rows (modes, 4) of one flight from the windows (first sample, sample after the last) of each mode."""
+    rows = np.zeros((len(plant.modes), COLUMNS))
+    position = {mode.name: i for i, mode in enumerate(plant.modes)}
+    for i, found in windows.items():
+        magnitude = np.full(len(label), np.nan)
+        if deviation is not None:
+            for index, said in enumerate(plant.labels):
+                if plant.modes[i].name in said.modes and (mine := label == index).any():
+                    active = sorted(position[name] for name in said.modes)
+                    magnitude[mine] = sizes(plant, active, deviation[mine])[:, active.index(i)]
+        inside = np.concatenate([magnitude[a:b] for a, b in found])
+        size = _settled(inside)
+        rows[i] = 1.0, max(found[0][0] - 1, 0), found[-1][1] - 1, np.mean(plant.modes[i].reach) if np.isnan(size) else size
+    return rows
+
+
+def _runs_of(label: Array, members: Sequence[Array]) -> dict[int, list[tuple[int, int]]]:
+    """For each mode, its windows of samples: the maximal runs of labels that contain it."""
+    windows: dict[int, list[tuple[int, int]]] = {}
+    for i, labels in enumerate(members):
+        acting = np.concatenate([[0], np.isin(label, labels).astype(np.int8), [0]])
+        edges = np.flatnonzero(np.diff(acting))
+        if edges.size:
+            windows[i] = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+    return windows
+
+
+def _members(plant: Plant) -> list[Array]:
+    """The labels that contain each mode."""
+    return [np.array([k for k, said in enumerate(plant.labels) if mode.name in said.modes], int) for mode in plant.modes]
+
+
+def true_declaration(plant: Plant, record: Record) -> Array:
+    """What was true of recorded flights: (N, modes, 4), the columns PRESENT, ONSET, END, SIZE.
+
+    Onset and end are steps: a fault acts on onset <= k < end, from the first time to the last. The size is that on the
+    mode's line, the median over the second half of the time in which it acted.
+    """
+    members = _members(plant)
+    rows = []
+    for label, target, length in zip(record.label, record.target, record.length, strict=True):
+        flown = label[: length + 1]
+        rows.append(_windows_to_rows(plant, _runs_of(flown, members), flown, _deviation(plant, target[: length + 1])))
+    return np.array(rows)
+
+
+def alarms(label: Array) -> list[tuple[int, int]]:
+    """The alarms of a flight (first sample, sample after the last), gaps bridged and short ones left out."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (label > 0).astype(np.int8), [0]]))).reshape(-1, 2).tolist()
+    joined: list[tuple[int, int]] = []
+    for first, last in edges:
+        if joined and first - joined[-1][1] <= BRIDGED:
+            joined[-1] = joined[-1][0], last
+        else:
+            joined.append((first, last))
+    return [(a, b) for a, b in joined if b - a >= SHORTEST]
+
+
+def declared(plant: Plant, said: Decisions, length: Array) -> Array:
+    """What a diagnoser's labels and estimates over flights amount to: (N, modes, 4), as `true_declaration`.
+
+    An alarm declares a mode that half of its samples name, or a twentieth of the flight's: not what was guessed at first
+    and soon corrected. The mode acted from the first of these samples to the last; what an alarm names first of those that
+    it declares began with the alarm. Sizes are those of the estimate on the label's lines; without an estimate, the middle
+    of the mode's reach.
+
+    Args:
+        plant: The plant.
+        said: What the diagnoser said.
+        length: (N,) last sample of each flight.
+    """
+    members, rows = _members(plant), []
+    for n, last in enumerate(length):
+        label = said.label[n, : last + 1].astype(np.int64)
+        windows: dict[int, list[tuple[int, int]]] = {}
+        for first, after in alarms(label):
+            enough = min(SHARE * (after - first), max(SHORTEST, LASTING * len(label)))
+            named: dict[int, tuple[int, int]] = {}
+            for i, labels in enumerate(members):
+                found = first + np.flatnonzero(np.isin(label[first:after], labels))
+                if len(found) >= enough:
+                    named[i] = int(found[0]), int(found[-1]) + 1
+            earliest = min((begin for begin, _ in named.values()), default=first)
+            for i, (begin, end) in named.items():
+                windows.setdefault(i, []).append((first if begin == earliest else begin, end))
+        estimate = None if said.estimate is None else _deviation(plant, said.estimate[n, : last + 1])
+        rows.append(_windows_to_rows(plant, windows, label, estimate))
+    return np.array(rows)
+
+
+def errors(plant: Plant, truth: Array, declaration: Array) -> Errors:
+    """How declarations (n, modes, 4) differ from the truth; PRESENT counts from 0.5 on."""
+    is_there, is_said = truth[..., PRESENT] >= 0.5, declaration[..., PRESENT] >= 0.5
+    both = is_there & is_said
+    a, b = truth[..., ONSET : END + 1], declaration[..., ONSET : END + 1]
+    common = np.maximum(np.minimum(a[..., 1], b[..., 1]) - np.maximum(a[..., 0], b[..., 0]), 0.0)
+    union = (a[..., 1] - a[..., 0]) + np.maximum(b[..., 1] - b[..., 0], 0.0) - common
+    overlap = common / np.maximum(union, 1.0)
+    return Errors(
+        (is_there == is_said).all(axis=-1),
+        np.where(both, b[..., 0] - a[..., 0], np.nan),
+        np.where(both, overlap, np.nan),
+        np.where(both, declaration[..., SIZE] - truth[..., SIZE], np.nan),
+    )
+
+
+def worth(plant: Plant, truth: Array, declaration: Array) -> Array:
+    """The reward of declarations (n,), 0 to 1: 0 for a wrong set of modes, 1 for a healthy flight that is called healthy.
+
+    Else the mean of 1, the overlap of the windows, and 1 less the error of the size as a share of its mode's reach (not
+    below 0), over the modes.
+    """
+    found = errors(plant, truth, declaration)
+    span = spans(plant)
+    size = np.maximum(1.0 - np.abs(found.size) / np.where(span > 0, span, 1.0), 0.0)
+    parts = np.stack([np.ones_like(size), found.overlap, size]).mean(axis=0)
+    there = truth[..., PRESENT] >= 0.5
+    mean = np.where(there, np.nan_to_num(parts), 0.0).sum(axis=-1) / np.maximum(there.sum(axis=-1), 1)
+    return np.where(found.exact, np.where(there.any(axis=-1), mean, 1.0), 0.0)
