@@ -4,7 +4,7 @@ import msgspec
 import pytest
 from conftest import ROOT, SHIPPED
 
-from baselines.reproduction.grid import KINDS, PAPER, missing, page, reasons_of, rows_of
+from benchmarks.grid import KINDS, PAPER, missing, page, reasons_of, rows_of
 from fdi_gym.diagnosis import diagnosers
 from fdi_gym.evaluation import evaluate
 from fdi_gym.row import write_rows
