@@ -29,6 +29,7 @@ CANDIDATES = {"CAUKF": 40, "GAUKF": 16, "SGAUKF": 4, "SGAUKF-odd": 4, "dual GAUK
 ALPHA = {"bench": (0.1, 0.9), "table5": (0.0, 1.0), "table4": (0.5, 0.9), "hard": (0.02, 0.4)}
 VARIANTS = ("bench", "table5", "table4", "hard", "severity")  # their places are part of the seeds
 PER_LABEL = {"bench": 5, "table5": 3, "severity": 2}  # episodes per fault label in a block
+SEVERITY_WINDOW = (1500, 4500)  # steps: from 15 s on, 30 s at one severity
 PER_BLOCK = {"hard": 30, "table4": 10}  # episodes in a block of those without labels
 
 
@@ -74,9 +75,10 @@ def _episode(b: Block, label: int, rng: np.random.Generator) -> FaultScenario:
             return cmg.table4(b.reference)
         case "hard":
             return cmg.intermittent(rng, b.reference).replace(physical=cmg.perturb(rng, b.level))
-        case _:  # 30 s at one severity, from 15 s on
-            faults = [cmg.loss(i, b.level, 1500, 4500) for i in cmg.SETS[label]]
-            return FaultScenario(plant=cmg.ID, steps=4500, faults=faults, reference={"profile": b.reference})
+        case _:
+            onset, end = SEVERITY_WINDOW
+            faults = [cmg.loss(i, b.level, onset, end) for i in cmg.SETS[label]]
+            return FaultScenario(plant=cmg.ID, steps=end, faults=faults, reference={"profile": b.reference})
 
 
 def show(plant: Plant, scenarios: list[FaultScenario], record: Record, method: str, **tuning: Any) -> Said:
