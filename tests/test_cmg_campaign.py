@@ -5,19 +5,12 @@ import itertools
 import numpy as np
 import pytest
 
-from baselines.reproduction.cmg_campaign import (
-    PER_BLOCK,
-    Piece,
-    Watched,
-    campaign,
-    hard_outcome,
-    run_piece,
-    scenarios_of,
-    window_outcome,
-)
-from baselines.reproduction.cmg_monte_carlo import GRIDS, campaign_tables
-from baselines.reproduction.cmg_satellite import plan
-from baselines.reproduction.cmg_statistics import Results
+from benchmarks.reproduction.cmg_satellite.blocks import PER_LABEL, Block, block_piece, scenarios_of
+from benchmarks.reproduction.cmg_satellite.campaign import VARIANTS, campaign
+from benchmarks.reproduction.cmg_satellite.outcomes import Said, hard_outcome, window_outcome
+from benchmarks.reproduction.cmg_satellite.plan import GRIDS, LEVELS, blocks, is_campaign
+from benchmarks.reproduction.cmg_satellite.results import Results
+from benchmarks.reproduction.pieces import pieces
 from fdi_gym.engine import simulate
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
@@ -34,7 +27,7 @@ def perfect(record, flags=()):
     n, samples = record.label.shape
     flag = np.zeros((n, samples), bool)
     flag[:, list(flags)] = True
-    return Watched(record.theta.copy(), record.label.copy(), np.zeros((n, samples)), flag, np.zeros(n, int), 0.0)
+    return Said(record.theta.copy(), record.label.copy(), np.zeros((n, samples)), flag, np.zeros(n, int), 0.0)
 
 
 def test_window_bookkeeping(plant):
@@ -84,30 +77,36 @@ def test_hard_bookkeeping(plant):
 
 
 def test_episodes_are_the_same_for_every_method_and_noise_level():
-    pieces = [Piece("bench", "slew", s, m, 1) for s, m in ((45, "UKF"), (75, "MEKF"))]
-    first, second = (scenarios_of(p) for p in pieces)
+    both = [Block("bench", "slew", s, m, 1) for s, m in ((45, "UKF"), (75, "MEKF"))]
+    first, second = (scenarios_of(b) for b in both)
     assert first == second
-    assert first != scenarios_of(pieces[0]._replace(block=2))
+    assert first != scenarios_of(both[0]._replace(number=2))
     labels = [frozenset(f.mode for f in s.faults) for s in first]
-    assert len(labels) == 15 * PER_BLOCK["bench"]
-    assert all(labels.count(label) == PER_BLOCK["bench"] for label in labels)
+    assert len(labels) == 15 * PER_LABEL["bench"]
+    assert all(labels.count(label) == PER_LABEL["bench"] for label in labels)
 
 
-def test_a_campaign_goes_on_where_it_was(tmp_path):
-    piece = Piece("severity", "slew", 45, "MEKF", 0, 0.5)
-    first = campaign(tmp_path, [piece], 1)
+def test_a_campaign_goes_on_where_it_was(tmp_path, monkeypatch):
+    """A block of shorter episodes, one per label: every loss of a half is told within 6 s, and nothing is flown again."""
+    monkeypatch.setattr("benchmarks.reproduction.cmg_satellite.blocks.SEVERITY_WINDOW", (300, 1200))
+    monkeypatch.setitem(PER_LABEL, "severity", 1)
+    block = Block("severity", "slew", 45, "MEKF", 0, 0.5)
+    jobs = {block.name(): (block_piece, (block,))}
+    first = pieces(tmp_path, jobs, 1)
     (file,) = tmp_path.iterdir()
     stamp = file.stat().st_mtime_ns
-    assert campaign(tmp_path, [piece], 1) == first
+    assert pieces(tmp_path, jobs, 1) == first
     assert file.stat().st_mtime_ns == stamp
-    assert np.mean([o["decided"] == o["truth"] for o in first[piece]["outcomes"]]) == 1.0
+    outcomes = first[block.name()]["outcomes"]
+    assert [o["truth"] for o in outcomes] == list(range(1, 16))
+    assert all(o["decided"] == o["truth"] and o["isolated"] < 6 for o in outcomes)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("method", "rmse"), [("GAUKF", 0.0367), ("SGAUKF", 0.0358), ("MEKF", 0.0372), ("CLAIR", 0.0240)])
 def test_bench_at_45_db(method, rmse):
     """Accuracy (30 of 30 in the data sheet) and mean faulty-phase RMSE within three standard errors of both."""
-    outcomes = run_piece(Piece("bench", "slew", 45, method, 0))["outcomes"]
+    outcomes = block_piece(Block("bench", "slew", 45, method, 0))["outcomes"]
     found = np.array([o["faulty"] for o in outcomes])
     wrong, sizes = np.mean([o["decided"] != o["truth"] for o in outcomes]), 1 / 30 + 1 / len(found)
     pooled = wrong * len(found) / (30 + len(found))
@@ -122,30 +121,30 @@ def test_bench_at_45_db(method, rmse):
 )
 def test_hard_at_45_db(method, sample):
     """Sample accuracy as in the data sheet (60 episodes there) within three standard errors."""
-    outcomes = run_piece(Piece("hard", "slew", 45, method, 0))["outcomes"]
+    outcomes = block_piece(Block("hard", "slew", 45, method, 0))["outcomes"]
     found = 100 * np.array([o["sample"] for o in outcomes])
     assert abs(found.mean() - sample) < 3 * found.std(ddof=1) * np.sqrt(1 / 60 + 1 / len(found))
 
 
 def test_the_plan_holds_the_campaign_and_no_block_twice():
     """300 episodes at least of each of the source's filters at each of its noise levels, before all else."""
-    blocks = plan(quick=False)
-    assert len(blocks) == len(set(blocks))
-    head = [p for p in blocks if p.variant == "bench" and p.method in GRIDS]
-    assert blocks[: len(head)] == head
-    for snr, method in itertools.product((45, 55, 75), GRIDS):
-        assert sum(p.snr == snr and p.method == method for p in head) * 15 * PER_BLOCK["bench"] >= 300
+    planned = blocks(quick=False)
+    assert len(planned) == len(set(planned))
+    head = [b for b in planned if is_campaign(b)]
+    assert planned[: len(head)] == head
+    for snr, method in itertools.product(LEVELS, GRIDS):
+        assert sum(b.snr == snr and b.method == method for b in head) * 15 * PER_LABEL["bench"] >= 300
 
 
 def test_sections_of_the_campaign():
-    """Accuracy, errors and cost from outcomes: one of 15 labels wrong, by one unit, at 45 dB."""
+    """Accuracy, errors and cost from outcomes: one of 15 labels wrong, by one unit."""
     o = {"pre": 0.1, "faulty": 0.2, "post": None, "scored": 0.9, "steps": 100}
     outcomes = [o | {"truth": i, "decided": 1 if i == 5 else i} for i in range(1, 16)]
     found = {
-        Piece("bench", "slew", 45, m, 0): {"outcomes": outcomes, "seconds": s, "samples": 15}
-        for m, s in zip(GRIDS, (3.0, 2.0, 1.0), strict=True)
+        Block(variant, "slew", snr, m): {"outcomes": outcomes, "seconds": seconds, "samples": 15}
+        for variant, snr, (m, seconds) in itertools.product(VARIANTS, LEVELS, zip(GRIDS, (3.0, 2.0, 1.0), strict=True))
     }
-    text = campaign_tables(Results(found))
+    text = campaign(Results(found))
     assert "93.3 [70.2, 98.8], n = 15" in text
     assert "|5{1,2}|.|1|.|.|.|.|" in text.replace(" ", "")
     assert "|GAUKF|45|15|1|0|1|0|" in text.replace(" ", "")

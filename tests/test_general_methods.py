@@ -14,7 +14,7 @@ from baselines.filters.joint_ukf import joint_ukf
 from baselines.filters.two_stage_ekf import two_stage_filter
 from baselines.filters.two_stage_kf import aging
 from baselines.filters.two_stage_kf import two_stage_filter as papers_two_stage
-from baselines.reproduction.consistency import measure, verdict
+from benchmarks.consistency import measure, verdict
 from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.diagnosis.fitting import flights_of
 from fdi_gym.engine import no_noise, simulate

@@ -8,7 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import fdi_gym  # noqa: F401 (registers the environments)
-from baselines.reproduction.numbered import fly
+from benchmarks.reproduction.numbered import fly
 from fdi_gym.engine import no_noise, simulate
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant

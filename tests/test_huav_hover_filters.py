@@ -10,7 +10,7 @@ from baselines.filters import robust_three_stage, three_stage
 from baselines.filters.hypothesis_bank import transitions
 from baselines.filters.propagation import Propagated, central_difference_propagation, extended_propagation, trim_model
 from baselines.oracles.matched_oracle import steady_filter
-from baselines.reproduction.numbered import fly
+from benchmarks.reproduction.numbered import fly
 from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, guarded, run
 from fdi_gym.diagnosis.filtering import readings
 from fdi_gym.engine import no_noise, simulate

@@ -1,4 +1,4 @@
-"""The grid: every method on every plant, on `standard` and `hard`: `python -m baselines.reproduction.grid`.
+"""The grid: every method on every plant, on `standard` and `hard`: `python -m benchmarks.grid`.
 
 Runs what has no row yet, measures the consistency of the general filters, and writes leaderboards/grid.md and grid.json.
 Rows and finished blocks are kept, so a killed run goes on.
@@ -12,12 +12,12 @@ from typing import Any
 
 import tyro
 
-from baselines.reproduction.consistency import FILTERS, measure
-from baselines.reproduction.tables import markdown, pieces
+from benchmarks.consistency import FILTERS, measure
+from benchmarks.reproduction.pieces import pieces
 from fdi_gym.diagnosis import diagnosers
 from fdi_gym.evaluation import applicable, evaluate
 from fdi_gym.files import pretty, read_json, write_whole
-from fdi_gym.leaderboard import clairvoyant, plain, read_rows
+from fdi_gym.leaderboard import clairvoyant, markdown, plain, read_rows
 from fdi_gym.row import Row, row_path, write_rows
 from fdi_gym.suite import Suite, load_suite
 
@@ -31,7 +31,7 @@ PAPER = {
 }
 INTRODUCTION = """# The grid
 
-Every method on every plant. Written by `python -m baselines.reproduction.grid` from the rows in `results/`. Balanced
+Every method on every plant. Written by `python -m benchmarks.grid` from the rows in `results/`. Balanced
 accuracy per sample in percent, with a 95 % bootstrap interval over the episodes; "-": not applicable, with the reason
 that the code gives, or not run yet, both below. Methods marked * know the truth. General methods need nothing but the
 plant's declaration.

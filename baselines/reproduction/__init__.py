@@ -1,1 +1,0 @@
-"""Published and reference figures, measured again: one module per plant, `python -m baselines.reproduction.<plant>`."""

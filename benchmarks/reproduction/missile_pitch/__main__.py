@@ -1,0 +1,8 @@
+"""The command; see the package's docstring."""
+
+from benchmarks.reproduction.missile_pitch.measure import plan
+from benchmarks.reproduction.missile_pitch.page import write
+from benchmarks.reproduction.pieces import command
+
+if __name__ == "__main__":
+    command("missile_pitch", plan, write)
