@@ -116,7 +116,7 @@ _I, _D3 = int64[::1], float64[:, :, ::1]
     void(
         int64, int64, int64, int64, int64, int64,
         float64, int64, int64, V, V, M, M, V, float64, _I,
-        uint64[::1], _I, _I, _I, _I, _I, M, _D3, _I, int64[:, ::1], int64[:, :, ::1],
+        uint64[::1], _I, _I, _I, _I, _I, _I, _I, M, _D3, _I, int64[:, ::1], int64[:, :, ::1],
         _I, _I, M, M, M, M, M, M, _D3,
         _I, int64, int64, _D3, float64[:, :, :, ::1], _D3, _D3, _D3, int64[:, ::1],
     )
@@ -124,15 +124,17 @@ _I, _D3 = int64[::1], float64[:, :, ::1]
 def fly(
     dynamics_address, output_address, control_address, known_address, project_address, outside_address,
     dt, substeps, true_feedback, nominal, q, sensor_box, command_box, sigma, limit, widths,
-    seed, steps, reference_at, disturbance_at, process_noise, sensor_noise, p, effects, counts, values, labels,
+    seed, steps, reference_at, disturbance_at, process_noise, sensor_noise, reference_step, disturbance_step,
+    p, effects, counts, values, labels,
     at, status, X, C, U, THETA, held, readings, histories,
     slots, first, samples, inputs, sensors, obs, state, theta, label,
 ):  # fmt: skip
     """Fly the flights in `slots` on by so many samples, into the rows from `first` on of obs, state, theta and label.
 
-    The second line of arguments is the plant's, the third the flights' (one row each; tables by address; a noise address
-    of 0: by counter), the fourth where they are, changed in place. `inputs` (samples, flights, n_u) is added to the command
-    within its range, `sensors` (samples, flights, n_y, FAULTS) is what is wrong with the sensors; either may be empty.
+    The second line of arguments is the plant's, the next two the flights' (one row each; tables by address, with a step of
+    0 where one row serves all samples; a noise address of 0: by counter), then where they are, changed in place. `inputs`
+    (samples, flights, n_u) is added to the command within its range, `sensors` (samples, flights, n_y, FAULTS) is what is
+    wrong with the sensors; either may be empty.
     """
     dynamics, output, control = map_at(dynamics_address), map_at(output_address), control_at(control_address)
     known, project, outside = known_at(known_address), project_at(project_address), outside_at(outside_address)
@@ -164,6 +166,7 @@ def fly(
             injected = process_noise[slot] != 0
             if not (injected or steady):
                 fill(seed[slot], k, min(TILE, samples - tile), used, words, normals)
+            step_r, step_d = reference_step[slot], disturbance_step[slot]
             references = _at(_pointer(reference_at[slot]), (last + 1, n_r), float64)
             disturbances = _at(_pointer(disturbance_at[slot]), (last + 1, n_d), float64)
             w = _at(_pointer(process_noise[slot]), (last, n), float64)
@@ -174,9 +177,9 @@ def fly(
                 row, t = first + s, k * dt
                 # sample k: what acts, what is measured, what is known
                 for i in range(n_r):
-                    r[i] = references[k, i]
+                    r[i] = references[k * step_r, i]
                 for i in range(n_d):
-                    d[i] = disturbances[min(k, last - 1), i]
+                    d[i] = disturbances[min(k, last - 1) * step_d, i]
                 _effects(k, True, dt, acting, count, values_i, held_i, nominal, a, b, g)
                 for j in range(n_theta):
                     theta_k[j] = a[j] + b[j]
@@ -233,7 +236,7 @@ def fly(
                         x[i] = before[i]
                 k += 1
                 for i in range(n_r):
-                    r[i] = references[k, i]
+                    r[i] = references[k * step_r, i]
                 if lost or outside(t + dt, x, r):
                     status[slot] = ENDED
             at[slot] = k

@@ -21,7 +21,7 @@ import numpy as np
 from fdi_gym import closed_loop
 from fdi_gym.closed_loop import FAULTS, FLYING, OVER, TERMINATED
 from fdi_gym.faults import Abrupt, FaultScenario, Hold, Incipient, Intermittent, Samples, Square
-from fdi_gym.plant import Plant, contiguous
+from fdi_gym.plant import Inputs, Plant, contiguous
 
 Array = np.ndarray
 
@@ -67,6 +67,14 @@ def no_noise(plant: Plant, steps: int) -> tuple[Array, Array]:
     return np.zeros((steps, len(plant.states))), np.zeros((steps + 1, len(plant.outputs)))
 
 
+class _Made(NamedTuple):
+    """What a flight follows: tables, the true label's changes, injected noise."""
+
+    inputs: Inputs
+    labels: list[tuple[int, int]]
+    noise: tuple[Array | None, Array | None]
+
+
 class Flights:
     """N flights under way: where each is, and the tables that it follows.
 
@@ -105,6 +113,7 @@ class Flights:
         self.counts, self.labels = np.zeros(n, np.int64), np.full((n, 2, 2), NEVER)
         self.tables: list[tuple[Any, ...]] = [()] * n  # reference, disturbance, w, v and samples of effects: by address
         self.addresses = np.zeros((4, n), np.int64)
+        self.steps = np.ones((2, n), np.int64)  # from a sample's row of reference and disturbance to the next; 0: one row
         self.values = np.zeros((n, 1), np.int64)
         self.widths = np.zeros(2, np.int64)  # of reference and disturbance
         self.begin(range(n), scenarios, noise)
@@ -139,23 +148,30 @@ class Flights:
         noise: Sequence[tuple[Array, Array]] | None = None,
     ) -> None:
         """Put new flights in these slots; the others go on. What is refused leaves all as they are."""
-        plant = self.plant
+        plant, where = self.plant, np.array(list(slots))
         made = [self._made(s, None if noise is None else noise[number]) for number, s in enumerate(scenarios)]
-        for i, scenario, (reference, disturbance, p, given) in zip(slots, scenarios, made, strict=True):
-            self.widths[:] = reference.shape[1], disturbance.shape[1]
-            self.x[i] = plant.trim_state if scenario.x0 is None else scenario.x0
-            self.p[i], self.c[i], self.u[i], self.theta[i] = p, plant.c0, plant.trim_command, plant.nominal_theta
-            self.k[i], self.length[i], self.status[i], self.seed[i] = 0, scenario.steps, FLYING, scenario.noise_seed
+        if len(where) != len(made):
+            raise ValueError(f"one scenario for each of the {len(where)} slots is needed, not {len(made)}")
+        self.widths[:] = made[0].inputs.reference.shape[1], made[0].inputs.disturbance.shape[1]
+        self.k[where], self.status[where], self.x[where], self.c[where] = 0, FLYING, plant.trim_state, plant.c0
+        self.u[where], self.theta[where] = plant.trim_command, plant.nominal_theta
+        self.length[where] = [scenario.steps for scenario in scenarios]
+        self.seed[where] = np.array([scenario.noise_seed for scenario in scenarios], np.uint64)
+        self.p[where] = [inputs.physical for inputs, *_ in made]
+        self.steps[:, where] = np.array([(len(i.reference) > 1, len(i.disturbance) > 1) for i, *_ in made]).T
+        for i, scenario, (inputs, labels, given) in zip(where.tolist(), scenarios, made, strict=True):
+            if scenario.x0 is not None:
+                self.x[i] = scenario.x0
             samples = self._set_effects(i, scenario)
-            self._set_labels(i, plant.label_changes(scenario))
-            self.tables[i] = (reference, disturbance, *given, samples)
+            self._set_labels(i, labels)
+            self.tables[i] = (inputs.reference, inputs.disturbance, *given, samples)
             self._point(i)
 
-    def _made(self, scenario: FaultScenario, noise: tuple[Array, Array] | None) -> tuple[Array, Array, Array, Any]:
-        """Reference, disturbance, physical parameters and injected noise of a scenario that the plant has accepted."""
+    def _made(self, scenario: FaultScenario, noise: tuple[Array, Array] | None) -> _Made:
+        """What a scenario that the plant accepts makes."""
         self.plant.validate(scenario)
-        reference, disturbance, p = self.plant.inputs(scenario)
-        return reference, disturbance, p, (None, None) if noise is None else self._checked_noise(noise, scenario.steps)
+        given = (None, None) if noise is None else self._checked_noise(noise, scenario.steps)
+        return _Made(self.plant.inputs(scenario), self.plant.label_changes(scenario), given)
 
     def _checked_noise(self, noise: tuple[Array, Array], steps: int) -> tuple[Array, Array]:
         w, v = (contiguous(a) for a in noise)
@@ -207,14 +223,16 @@ class Flights:
     def _point(self, i: int) -> None:
         """Note where flight i's tables lie; they live as long as this does."""
         *tables, samples = self.tables[i]
-        self.addresses[:, i] = [0 if table is None else table.__array_interface__["data"][0] for table in tables]
+        for column, table in enumerate(tables):
+            self.addresses[column, i] = 0 if table is None else table.__array_interface__["data"][0]
         for e, table in samples.items():
             self.values[i, e] = table.__array_interface__["data"][0]
 
     def arrays(self) -> tuple[Array, ...]:
         """Tables and state in the order of the compiled call."""
         return (
-            self.seed, self.length, *self.addresses, self.p, self.effects, self.counts, self.values, self.labels,
+            self.seed, self.length, *self.addresses, *self.steps,
+            self.p, self.effects, self.counts, self.values, self.labels,
             self.k, self.status, self.x, self.c, self.u, self.theta, self.held, self.readings, self.history,
         )  # fmt: skip
 

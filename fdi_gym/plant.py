@@ -24,8 +24,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi_gym.checks import check_declaration, check_scenario, is_whole, twice, unknown
-from fdi_gym.faults import FaultProcess, FaultScenario, ThetaTable, theta_table
+from fdi_gym.faults import FaultProcess, FaultScenario
 from fdi_gym.shapes import OPEN, Shapes
+from fdi_gym.theta import ThetaTable, theta_table
 
 Array = np.ndarray
 
@@ -106,7 +107,10 @@ class Kernels(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What a scenario's dicts make: rows (steps + 1, n_r) and (steps + 1, n_d), parameters (n_p,)."""
+    """What a scenario's dicts make: rows (steps + 1, n_r) and (steps + 1, n_d), parameters (n_p,).
+
+    Rows that are the same at every sample are one row, (1, n).
+    """
 
     reference: Array
     disturbance: Array
@@ -206,8 +210,9 @@ class Plant:
         true_feedback: The controller gets the sensors' values before their noise is added; diagnosers never do.
         physical: Maps a scenario's physical parameters to the vector p; of {} it gives the nominal model.
         perturb: Draws physical parameters at a level of mismatch: perturb(rng, level) -> dict, or None if it has none.
-        reference: Maps a scenario to the exogenous reference rows (steps + 1, n_r).
-        disturbance: Maps a scenario to the disturbance rows (steps + 1, n_d).
+        reference: Maps a scenario to the exogenous reference rows (steps + 1, n_r). Of a row that stays the same,
+            `np.broadcast_to(row, (steps + 1, n_r))` is kept once.
+        disturbance: Maps a scenario to the disturbance rows (steps + 1, n_d), likewise.
         measured_disturbance: What the known signals say of the disturbance that is held over an interval:
             measured_disturbance(t, before, now) -> (n, n_d), from its start t [s] and the known signals (n, n_known) at
             its two ends. None where nothing is known of it.
@@ -396,7 +401,7 @@ class Plant:
         """
         rows = scenario.steps + 1
         if self.disturbance is None:
-            d = np.zeros((rows, len(self.disturbances)))
+            d = np.zeros((1, len(self.disturbances)))
         else:
             d = self._made("disturbance", self.disturbance, scenario, (rows, len(self.disturbances)))
         p = self.nominal_p
@@ -406,20 +411,21 @@ class Plant:
 
     def _made(self, name: str, make: Callable[[FaultScenario], Array], scenario: FaultScenario, shape: tuple) -> Array:
         try:
-            made = contiguous(make(scenario))
+            made = np.asarray(make(scenario), float)
         except Exception as error:  # whatever the plant's author did not think of
             what = f"{type(error).__name__}: {error}"
             raise ValueError(f"{name} of a {self.id} scenario, {reprlib.repr(getattr(scenario, name))}: {what}") from error
         fits = made.ndim == len(shape) and all(n in (m, None) for m, n in zip(made.shape, shape, strict=True))
-        if not fits or not np.isfinite(made).all():
+        given = contiguous(made[:1] if fits and made.ndim == 2 and made.strides[0] == 0 else made)  # one row, broadcast
+        if not fits or not np.isfinite(given).all():
             raise ValueError(
                 f"{name} of a {self.id} scenario: the plant makes finite numbers in the shape {shape} of it, not those of "
                 f"{reprlib.repr(getattr(scenario, name))} ({made.shape}{', not all finite' if fits else ''})"
             )
-        return made
+        return given
 
     def theta_table(self, scenario: FaultScenario) -> ThetaTable:
-        """What the scenario makes of theta (see `fdi_gym.faults.theta_table`)."""
+        """What the scenario makes of theta (see `fdi_gym.theta.theta_table`)."""
         return theta_table(scenario, self.nominal_theta, self.theta_entries, self.command_names, self.dt)
 
     def process(self, name: str) -> FaultProcess:

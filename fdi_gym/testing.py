@@ -17,9 +17,10 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from fdi_gym.checks import check_declaration
 from fdi_gym.diagnosis import Decisions, Diagnoser, guarded, run
+from fdi_gym.drawing import streams
 from fdi_gym.engine import Record, no_noise, simulate
 from fdi_gym.envs import FDIEnv, FDIVectorEnv
-from fdi_gym.faults import Fault, FaultScenario, Incipient, Intermittent, draw, streams
+from fdi_gym.faults import Fault, FaultScenario, Incipient, Intermittent, draw
 from fdi_gym.plant import Array, Plant, Signal
 
 
@@ -101,7 +102,7 @@ def _check_record(plant: Plant, name: str, scenarios: Sequence[FaultScenario], r
                     size = np.asarray(mode.size(record.theta[i, start + 1 : stop + 1]))
                     assert size.shape == (stop - start,), f"{name}: the size of {mode.name} is one number per sample"
                     assert (size >= 0).all(), f"{name}: the size of {mode.name} is negative or no number"
-        d = plant.inputs(scenario).disturbance[None]
+        d = np.broadcast_to(plant.inputs(scenario).disturbance, (scenario.steps + 1, len(plant.disturbances)))[None]
         _check_range(f"{name}: the disturbance", plant.disturbances, d)
         if plant.measured_disturbance is not None and flown:
             t = np.arange(flown)[:, None] * plant.dt
@@ -155,7 +156,7 @@ def _check_model(plant: Plant, scenario: FaultScenario) -> None:
     scenario = scenario.replace(physical={}).without_faults()
     record = simulate(plant, [scenario], [no_noise(plant, scenario.steps)])
     steps = min(50, int(record.length[0]))
-    d = plant.inputs(scenario).disturbance[:steps]
+    d = np.broadcast_to(plant.inputs(scenario).disturbance, (scenario.steps + 1, len(plant.disturbances)))[:steps]
     _, u, _ = plant.split(record.obs[0])
     t = np.arange(steps) * plant.dt
     predicted = plant.propagate(t, record.state[0, :steps], u[1 : steps + 1], None, d)
