@@ -173,6 +173,10 @@ def fly(
             v = _at(_pointer(sensor_noise[slot]), (last + 1, n_y), float64)
             acting, count, values_i, held_i = effects[slot], counts[slot], values[slot], held[slot]
             readings_i, history, segment = readings[slot], histories[slot], 0
+            holds = False
+            for e in range(count):
+                holds = holds or acting[e, KIND] == HOLD
+            drifts = _effects(k, True, dt, acting, count, values_i, held_i, nominal, a, b, g)
             for s in range(tile, min(tile + TILE, samples)):
                 row, t = first + s, k * dt
                 # sample k: what acts, what is measured, what is known
@@ -180,7 +184,8 @@ def fly(
                     r[i] = references[k * step_r, i]
                 for i in range(n_d):
                     d[i] = disturbances[min(k, last - 1) * step_d, i]
-                _effects(k, True, dt, acting, count, values_i, held_i, nominal, a, b, g)
+                if count:
+                    drifts = _effects(k, True, dt, acting, count, values_i, held_i, nominal, a, b, g)
                 for j in range(n_theta):
                     theta_k[j] = a[j] + b[j]
                 output(t, x, u, theta_k, d, p_i, y)
@@ -217,10 +222,11 @@ def fly(
                     for i in range(n_u):
                         if inputs[s, slot, i]:
                             u[i] = min(max(u[i] + inputs[s, slot, i], command_box[0, i]), command_box[1, i])
-                for e in range(count):
-                    if acting[e, KIND] == HOLD and k == acting[e, ONSET] - acting[e, SECOND]:
-                        held_i[e] = u[np.int64(acting[e, FIRST])]
-                drifts = _effects(k, False, dt, acting, count, values_i, held_i, nominal, a, b, g)
+                if holds:  # other faults do in the step what the sensors met
+                    for e in range(count):
+                        if acting[e, KIND] == HOLD and k == acting[e, ONSET] - acting[e, SECOND]:
+                            held_i[e] = u[np.int64(acting[e, FIRST])]
+                    drifts = _effects(k, False, dt, acting, count, values_i, held_i, nominal, a, b, g)
                 for i in range(n):
                     before[i] = x[i]
                 interval(dynamics, project, t, dt, substeps, x, u, drifts, a, b, g, d, p_i, acts, k1, k2, k3, k4, z)
