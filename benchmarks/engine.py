@@ -23,8 +23,8 @@ import numpy as np
 
 import fdi_gym  # noqa: F401
 from fdi_gym import envs as environments
+from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.faults import draw
-from fdi_gym.plant import load_plant, plant_sources
 
 
 class Clock:

@@ -6,7 +6,7 @@ environment, a picture or a network is first made.
 
 import gymnasium as gym
 
-from fdi_gym.plant import PlantSource, add_plant_source, plant_sources
+from fdi_gym.discovery import PlantSource, add_plant_source, plant_sources
 
 __version__ = "0.1.0"
 

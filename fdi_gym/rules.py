@@ -15,8 +15,9 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box, Discrete, Space
 
+from fdi_gym.discovery import load_plant
 from fdi_gym.faults import FaultScenario, draw
-from fdi_gym.plant import Array, Plant, Signal, load_plant
+from fdi_gym.plant import Array, Plant, Signal
 
 TASKS = ("isolation", "identification")
 UNITS = ("physical", "scaled")

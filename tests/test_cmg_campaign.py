@@ -18,9 +18,9 @@ from baselines.reproduction.cmg_campaign import (
 from baselines.reproduction.cmg_monte_carlo import GRIDS, campaign_tables
 from baselines.reproduction.cmg_satellite import plan
 from baselines.reproduction.cmg_statistics import Results
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
 from fdi_gym.faults import FaultScenario
-from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
 
 

@@ -366,7 +366,7 @@ FLY = """
 import numpy as np
 from fdi_gym.engine import simulate
 from fdi_gym.faults import draw
-from fdi_gym.plant import load_plant
+from fdi_gym.discovery import load_plant
 plant = load_plant("B747Lateral")
 print(simulate(plant, [draw(plant.process("standard"), 1).replace(steps=20, faults=[])]).obs.tobytes().hex()[-64:])
 """

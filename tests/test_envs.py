@@ -12,10 +12,10 @@ from conftest import build
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
 from fdi_gym.envs import CHUNK, FDIEnv, FDIVectorEnv
 from fdi_gym.faults import FaultScenario, draw
-from fdi_gym.plant import load_plant
 from fdi_gym.plants import b747_lateral as b747
 
 

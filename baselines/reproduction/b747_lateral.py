@@ -30,9 +30,10 @@ from baselines.reproduction.b747_reference import (
 from baselines.reproduction.numbered import fly
 from baselines.reproduction.tables import compared, markdown, pieces
 from fdi_gym.diagnosis import Decisions, make_diagnoser, run
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import Record
 from fdi_gym.faults import FaultScenario, draw
-from fdi_gym.plant import Array, Plant, load_plant
+from fdi_gym.plant import Array, Plant
 
 GROUPS = 20  # the reference's seeds, with 20 episodes each
 DT = 0.1

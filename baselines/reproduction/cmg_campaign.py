@@ -18,9 +18,10 @@ from baselines.oracles.mekf_clairvoyant import changes
 from baselines.reproduction.numbered import fly
 from baselines.reproduction.tables import pieces
 from fdi_gym.diagnosis import find_diagnoser, make_diagnoser, run
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import Record
 from fdi_gym.faults import FaultScenario
-from fdi_gym.plant import Array, Plant, load_plant
+from fdi_gym.plant import Array, Plant
 from fdi_gym.plants import cmg_satellite as cmg
 
 METHODS = {

@@ -10,9 +10,9 @@ from baselines.filters.mekf import first_covariance
 from baselines.oracles.cramer_rao_oracle import Q_FLOOR, bound_step, opened
 from baselines.reproduction.cmg_campaign import Piece, scenarios_of, table4_outcome, watch
 from baselines.reproduction.numbered import fly
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate, white_noise
 from fdi_gym.faults import FaultScenario
-from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
 
 AFTER = (100, 300, 1000, 3000)  # samples after the onset at which the bound is read

@@ -28,11 +28,12 @@ from baselines.reproduction.huav_reference import (
 from baselines.reproduction.numbered import fly
 from baselines.reproduction.tables import markdown, pieces
 from fdi_gym.diagnosis import Diagnoser, filtering, make_diagnoser, run
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import Record
 from fdi_gym.estimation.belief import fault_inputs
 from fdi_gym.estimation.labels import channel_sets
 from fdi_gym.faults import FaultScenario
-from fdi_gym.plant import Array, Plant, load_plant
+from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.huav_hover import CHANNELS, ID, disturbance_rows, episode, fault_free_episode, paper, prescribed_noise
 
 DT, MRAD = 0.02, 1e-3
