@@ -15,7 +15,7 @@ def _register_environment(plant_id: str, version: int) -> None:
     gym.register(
         id=f"{plant_id}-Faults-v{version}",
         entry_point="fdi_gym.envs:FDIEnv",
-        vector_entry_point="fdi_gym.envs:FDIVectorEnv",
+        vector_entry_point="fdi_gym.vector_envs:FDIVectorEnv",
         kwargs={"plant": plant_id},
     )
 

@@ -14,8 +14,9 @@ from conftest import build
 from scipy import stats
 
 from fdi_gym import closed_loop, noise
-from fdi_gym.engine import Chunk, Flights, advance, no_noise, simulate, white_noise
+from fdi_gym.engine import advance, no_noise, simulate, white_noise
 from fdi_gym.faults import Abrupt, Fault, Hold, Samples, draw
+from fdi_gym.flights import Chunk, Flights
 
 ROOT = Path(__file__).resolve().parents[1]
 

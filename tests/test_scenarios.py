@@ -34,7 +34,8 @@ from fdi_gym.faults import (
 )
 from fdi_gym.plant import Kernels, Label
 from fdi_gym.shapes import OPEN
-from fdi_gym.testing import _check_range, check_plant
+from fdi_gym.testing import check_plant
+from fdi_gym.testing.plants import _check_range
 
 NAN, INF = math.nan, math.inf
 VARIANTS = (
