@@ -18,10 +18,10 @@ from filterpy.kalman import KalmanFilter
 
 import fdi_gym  # noqa: F401
 from baselines.filters import augmented_kf, two_stage_kf
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
 from fdi_gym.estimation.linear import linear_model
 from fdi_gym.faults import draw
-from fdi_gym.plant import load_plant
 from fdi_gym.plants import b747_lateral as b747
 
 

@@ -18,8 +18,9 @@ from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from baselines.filters.joint_ukf import N_XI
 from fdi_gym.diagnosis import make_diagnoser
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
-from fdi_gym.plant import Plant, load_plant
+from fdi_gym.plant import Plant
 from fdi_gym.plants import cmg_satellite as cmg
 
 

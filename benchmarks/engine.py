@@ -22,9 +22,10 @@ import gymnasium as gym
 import numpy as np
 
 import fdi_gym  # noqa: F401
-from fdi_gym import envs as environments
+from fdi_gym import rules
+from fdi_gym.discovery import load_plant, plant_sources
+from fdi_gym.envs import FDIEnv
 from fdi_gym.faults import draw
-from fdi_gym.plant import load_plant, plant_sources
 
 
 class Clock:
@@ -124,7 +125,7 @@ def chunk_lengths(repeats):
     """CPU nanoseconds per step of a vector environment, and the longest step, for chunks of several lengths."""
     for plant_id in ("B747Lateral", "CMGSatellite"):
         for chunk in (32, 64, 128, 256, 512, 1024):
-            environments.CHUNK = chunk
+            rules.CHUNK = chunk
             envs = gym.make_vec(f"{plant_id}-Faults-v0", num_envs=1024)
             envs.reset(seed=0)
             actions, longest = np.zeros(1024, int), 0.0
@@ -191,7 +192,7 @@ def main():
     from fdi_gym.sb3 import make_vec_env
 
     ours = make_vec_env(ids["B747Lateral"], 256, seed=0)
-    dummy = DummyVecEnv([lambda: environments.FDIEnv("B747Lateral") for _ in range(256)])
+    dummy = DummyVecEnv([lambda: FDIEnv("B747Lateral") for _ in range(256)])
     ours.reset(), dummy.reset()
     found = interleaved({"bridge": lambda: bridge(ours, 2400), "dummy": lambda: bridge(dummy, 300)}, 3)
     print(f"SB3 bridge / DummyVecEnv at 256: {found['bridge'][0] / found['dummy'][0]:.1f} "

@@ -23,11 +23,12 @@ import tyro
 from filterpy.kalman import KalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from fdi_gym.diagnosis import make_diagnoser, run
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
 from fdi_gym.estimation import gaussian
 from fdi_gym.estimation.linear import linear_model
 from fdi_gym.faults import draw
-from fdi_gym.plant import Plant, load_plant
+from fdi_gym.plant import Plant
 
 KALMAN = ("two_stage_kf", "augmented_kf", "augmented_ekf")  # diagnosers of the 747
 UNSCENTED = ("augmented_ukf", "joint_ukf")  # of the satellite

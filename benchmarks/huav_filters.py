@@ -17,8 +17,8 @@ import scipy.linalg
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from fdi_gym.diagnosis import make_diagnoser
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
-from fdi_gym.plant import load_plant
 from fdi_gym.plants.huav_hover import DT, dynamics, episode
 
 X0_STD = (*[0.1] * 3, *[0.02] * 6, *[0.005] * 2)  # as in baselines/tuning/HUAVHover.json

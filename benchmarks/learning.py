@@ -15,10 +15,10 @@ import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from fdi_gym.diagnosis import NotApplicableError, make_diagnoser, run
+from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.engine import simulate
 from fdi_gym.envs import FDIEnv
 from fdi_gym.faults import draw
-from fdi_gym.plant import load_plant, plant_sources
 from fdi_gym.sb3 import FDIVecEnv, make_vec_env
 from fdi_gym.wrappers import DelayAwareReward, VectorHistory
 

@@ -7,9 +7,10 @@ import numpy as np
 
 from baselines.filters.kalman_filter import nominal_filter
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, run
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
 from fdi_gym.faults import draw
-from fdi_gym.plant import Plant, load_plant
+from fdi_gym.plant import Plant
 from fdi_gym.testing import check_diagnoser
 
 

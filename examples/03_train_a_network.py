@@ -9,9 +9,9 @@ from baselines.networks.flights import Source
 from baselines.networks.identification import Shape
 from baselines.networks.supervised import Recipe, Run
 from fdi_gym.diagnosis import make_diagnoser, run
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
 from fdi_gym.faults import draw
-from fdi_gym.plant import load_plant
 
 # Change the block length, the memory of the identified model, the width, the flights: what pays?
 parser = argparse.ArgumentParser()

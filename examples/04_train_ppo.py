@@ -9,9 +9,9 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from baselines.networks.adapters import from_sb3
 from fdi_gym.diagnosis import run
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
 from fdi_gym.faults import draw
-from fdi_gym.plant import load_plant
 from fdi_gym.sb3 import FDIVecEnv
 from fdi_gym.wrappers import DelayAwareReward, VectorHistory
 

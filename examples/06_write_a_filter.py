@@ -44,9 +44,9 @@ def my_filter(plant: Plant, belief: Belief, calibration: Calibration) -> Diagnos
 
 if __name__ == "__main__":
     from fdi_gym.diagnosis import fit, run
+    from fdi_gym.discovery import load_plant
     from fdi_gym.engine import simulate
     from fdi_gym.faults import draw
-    from fdi_gym.plant import load_plant
 
     plant = load_plant("B747Lateral")
     flights = simulate(plant, [draw(plant.process("standard"), seed) for seed in range(10)])

@@ -6,7 +6,7 @@ environment, a picture or a network is first made.
 
 import gymnasium as gym
 
-from fdi_gym.plant import PlantSource, add_plant_source, plant_sources
+from fdi_gym.discovery import PlantSource, add_plant_source, plant_sources
 
 __version__ = "0.1.0"
 
@@ -15,7 +15,7 @@ def _register_environment(plant_id: str, version: int) -> None:
     gym.register(
         id=f"{plant_id}-Faults-v{version}",
         entry_point="fdi_gym.envs:FDIEnv",
-        vector_entry_point="fdi_gym.envs:FDIVectorEnv",
+        vector_entry_point="fdi_gym.vector_envs:FDIVectorEnv",
         kwargs={"plant": plant_id},
     )
 

@@ -140,9 +140,9 @@ def freeze(
         settings: Tuning that belongs to the suite: {"diagnoser": {"keyword": value}}.
         folder: Where the file goes; default: beside the other suites.
     """
+    from fdi_gym.discovery import load_plant
     from fdi_gym.files import decode
     from fdi_gym.listing import find_plant
-    from fdi_gym.plant import load_plant
     from fdi_gym.suite import SUITES, Suite, checked_options
     from fdi_gym.suite import freeze as write
 

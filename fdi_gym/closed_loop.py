@@ -116,7 +116,7 @@ _I, _D3 = int64[::1], float64[:, :, ::1]
     void(
         int64, int64, int64, int64, int64, int64,
         float64, int64, int64, V, V, M, M, V, float64, _I,
-        uint64[::1], _I, _I, _I, _I, _I, M, _D3, _I, int64[:, ::1], int64[:, :, ::1],
+        uint64[::1], _I, _I, _I, _I, _I, _I, _I, M, _D3, _I, int64[:, ::1], int64[:, :, ::1],
         _I, _I, M, M, M, M, M, M, _D3,
         _I, int64, int64, _D3, float64[:, :, :, ::1], _D3, _D3, _D3, int64[:, ::1],
     )
@@ -124,15 +124,17 @@ _I, _D3 = int64[::1], float64[:, :, ::1]
 def fly(
     dynamics_address, output_address, control_address, known_address, project_address, outside_address,
     dt, substeps, true_feedback, nominal, q, sensor_box, command_box, sigma, limit, widths,
-    seed, steps, reference_at, disturbance_at, process_noise, sensor_noise, p, effects, counts, values, labels,
+    seed, steps, reference_at, disturbance_at, process_noise, sensor_noise, reference_step, disturbance_step,
+    p, effects, counts, values, labels,
     at, status, X, C, U, THETA, held, readings, histories,
     slots, first, samples, inputs, sensors, obs, state, theta, label,
 ):  # fmt: skip
     """Fly the flights in `slots` on by so many samples, into the rows from `first` on of obs, state, theta and label.
 
-    The second line of arguments is the plant's, the third the flights' (one row each; tables by address; a noise address
-    of 0: by counter), the fourth where they are, changed in place. `inputs` (samples, flights, n_u) is added to the command
-    within its range, `sensors` (samples, flights, n_y, FAULTS) is what is wrong with the sensors; either may be empty.
+    The second line of arguments is the plant's, the next two the flights' (one row each; tables by address, with a step of
+    0 where one row serves all samples; a noise address of 0: by counter), then where they are, changed in place. `inputs`
+    (samples, flights, n_u) is added to the command within its range, `sensors` (samples, flights, n_y, FAULTS) is what is
+    wrong with the sensors; either may be empty.
     """
     dynamics, output, control = map_at(dynamics_address), map_at(output_address), control_at(control_address)
     known, project, outside = known_at(known_address), project_at(project_address), outside_at(outside_address)
@@ -164,20 +166,26 @@ def fly(
             injected = process_noise[slot] != 0
             if not (injected or steady):
                 fill(seed[slot], k, min(TILE, samples - tile), used, words, normals)
+            step_r, step_d = reference_step[slot], disturbance_step[slot]
             references = _at(_pointer(reference_at[slot]), (last + 1, n_r), float64)
             disturbances = _at(_pointer(disturbance_at[slot]), (last + 1, n_d), float64)
             w = _at(_pointer(process_noise[slot]), (last, n), float64)
             v = _at(_pointer(sensor_noise[slot]), (last + 1, n_y), float64)
             acting, count, values_i, held_i = effects[slot], counts[slot], values[slot], held[slot]
             readings_i, history, segment = readings[slot], histories[slot], 0
+            holds = False
+            for e in range(count):
+                holds = holds or acting[e, KIND] == HOLD
+            drifts = _effects(k, True, dt, acting, count, values_i, held_i, nominal, a, b, g)
             for s in range(tile, min(tile + TILE, samples)):
                 row, t = first + s, k * dt
                 # sample k: what acts, what is measured, what is known
                 for i in range(n_r):
-                    r[i] = references[k, i]
+                    r[i] = references[k * step_r, i]
                 for i in range(n_d):
-                    d[i] = disturbances[min(k, last - 1), i]
-                _effects(k, True, dt, acting, count, values_i, held_i, nominal, a, b, g)
+                    d[i] = disturbances[min(k, last - 1) * step_d, i]
+                if count:
+                    drifts = _effects(k, True, dt, acting, count, values_i, held_i, nominal, a, b, g)
                 for j in range(n_theta):
                     theta_k[j] = a[j] + b[j]
                 output(t, x, u, theta_k, d, p_i, y)
@@ -214,10 +222,11 @@ def fly(
                     for i in range(n_u):
                         if inputs[s, slot, i]:
                             u[i] = min(max(u[i] + inputs[s, slot, i], command_box[0, i]), command_box[1, i])
-                for e in range(count):
-                    if acting[e, KIND] == HOLD and k == acting[e, ONSET] - acting[e, SECOND]:
-                        held_i[e] = u[np.int64(acting[e, FIRST])]
-                drifts = _effects(k, False, dt, acting, count, values_i, held_i, nominal, a, b, g)
+                if holds:  # other faults do in the step what the sensors met
+                    for e in range(count):
+                        if acting[e, KIND] == HOLD and k == acting[e, ONSET] - acting[e, SECOND]:
+                            held_i[e] = u[np.int64(acting[e, FIRST])]
+                    drifts = _effects(k, False, dt, acting, count, values_i, held_i, nominal, a, b, g)
                 for i in range(n):
                     before[i] = x[i]
                 interval(dynamics, project, t, dt, substeps, x, u, drifts, a, b, g, d, p_i, acts, k1, k2, k3, k4, z)
@@ -233,7 +242,7 @@ def fly(
                         x[i] = before[i]
                 k += 1
                 for i in range(n_r):
-                    r[i] = references[k, i]
+                    r[i] = references[k * step_r, i]
                 if lost or outside(t + dt, x, r):
                     status[slot] = ENDED
             at[slot] = k

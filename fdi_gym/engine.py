@@ -11,7 +11,7 @@ feed back.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -19,13 +19,14 @@ import numba
 import numpy as np
 
 from fdi_gym import closed_loop
-from fdi_gym.closed_loop import FAULTS, FLYING, OVER, TERMINATED
-from fdi_gym.faults import Abrupt, FaultScenario, Hold, Incipient, Intermittent, Samples, Square
-from fdi_gym.plant import Plant, contiguous
+from fdi_gym.closed_loop import FAULTS
+from fdi_gym.faults import FaultScenario
+from fdi_gym.flights import Chunk, Flights
+from fdi_gym.model import contiguous
+from fdi_gym.plant import Plant
 
 Array = np.ndarray
 
-NEVER = np.int64(2**62)  # a sample that does not come
 WORTH_A_THREAD = 4096  # samples; fewer are flown sooner than a thread is started
 
 
@@ -44,15 +45,6 @@ class Record(NamedTuple):
     terminated: Array  # (N,) bool, ended before its scenario's last step
 
 
-class Chunk(NamedTuple):
-    """Consecutive samples of N flights, in (sample, flight, signal) order. Rows after a flight's end mean nothing."""
-
-    obs: Array  # (m, N, n_obs)
-    state: Array  # (m, N, n_x)
-    theta: Array  # (m, N, n_theta)
-    label: Array  # (m, N) int64
-
-
 def white_noise(plant: Plant, rng: np.random.Generator, steps: int) -> tuple[Array, Array]:
     """Process noise w (steps, n_x) and sensor noise v (steps + 1, n_y) from a generator, to be injected."""
     v = rng.standard_normal((steps + 1, len(plant.outputs)))
@@ -65,165 +57,6 @@ def white_noise(plant: Plant, rng: np.random.Generator, steps: int) -> tuple[Arr
 def no_noise(plant: Plant, steps: int) -> tuple[Array, Array]:
     """The noise of a deterministic check: none, in the shapes of `white_noise`."""
     return np.zeros((steps, len(plant.states))), np.zeros((steps + 1, len(plant.outputs)))
-
-
-class Flights:
-    """N flights under way: where each is, and the tables that it follows.
-
-    Args:
-        plant: The plant; its physical parameters come from each scenario.
-        scenarios: One per flight; they may differ in length.
-        noise: (w (K, n_x), v (K + 1, n_y)) per flight. Default: by counter, from each scenario's noise seed.
-        longest_lag: Samples that a sensor fault may lag behind.
-
-    Attributes:
-        k: (N,) the sample that each flight comes to next; the last one where it is over.
-        length: (N,) its last sample: as the scenario says, until it ends early.
-
-    Raises:
-        ValueError: A scenario that the plant refuses, or noise of another shape.
-    """
-
-    def __init__(
-        self,
-        plant: Plant,
-        scenarios: Sequence[FaultScenario],
-        noise: Sequence[tuple[Array, Array]] | None = None,
-        longest_lag: int = 0,
-    ):
-        n = len(scenarios)
-        n_x, n_y, n_u, n_theta = (len(a) for a in (plant.states, plant.outputs, plant.commands, plant.theta))
-        self.plant = plant
-        self._entries = {s.name: j for j, s in enumerate(plant.theta)}
-        self._commands = {s.name: j for j, s in enumerate(plant.commands)}
-        self.k, self.length = np.zeros(n, np.int64), np.zeros(n, np.int64)
-        self.seed, self.status = np.zeros(n, np.uint64), np.full(n, OVER, np.int64)
-        self.x, self.c, self.u = np.zeros((n, n_x)), np.zeros((n, len(plant.c0))), np.zeros((n, n_u))
-        self.theta, self.p = np.zeros((n, n_theta)), np.zeros((n, len(plant.nominal_p)))
-        self.readings, self.history = np.zeros((n, n_y)), np.zeros((n, longest_lag + 1 if longest_lag else 0, n_y))
-        self.effects, self.held = np.zeros((n, 1, closed_loop.COLUMNS)), np.zeros((n, 1))
-        self.counts, self.labels = np.zeros(n, np.int64), np.full((n, 2, 2), NEVER)
-        self.tables: list[tuple[Any, ...]] = [()] * n  # reference, disturbance, w, v and samples of effects: by address
-        self.addresses = np.zeros((4, n), np.int64)
-        self.values = np.zeros((n, 1), np.int64)
-        self.widths = np.zeros(2, np.int64)  # of reference and disturbance
-        self.begin(range(n), scenarios, noise)
-
-    def __len__(self) -> int:
-        return len(self.k)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name not in ("addresses", "values")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        self.addresses = np.zeros((4, len(self)), np.int64)
-        self.values = np.zeros(self.effects.shape[:2], np.int64)
-        for i in range(len(self)):
-            self._point(i)
-
-    @property
-    def over(self) -> Array:
-        """(N,) bool: the last sample has been flown."""
-        return self.status >= OVER
-
-    @property
-    def terminated(self) -> Array:
-        """(N,) bool: ended before its scenario's last step."""
-        return self.status == TERMINATED
-
-    def begin(
-        self,
-        slots: Iterable[int],
-        scenarios: Sequence[FaultScenario],
-        noise: Sequence[tuple[Array, Array]] | None = None,
-    ) -> None:
-        """Put new flights in these slots; the others go on. What is refused leaves all as they are."""
-        plant = self.plant
-        made = [self._made(s, None if noise is None else noise[number]) for number, s in enumerate(scenarios)]
-        for i, scenario, (reference, disturbance, p, given) in zip(slots, scenarios, made, strict=True):
-            self.widths[:] = reference.shape[1], disturbance.shape[1]
-            self.x[i] = plant.trim_state if scenario.x0 is None else scenario.x0
-            self.p[i], self.c[i], self.u[i], self.theta[i] = p, plant.c0, plant.trim_command, plant.nominal_theta
-            self.k[i], self.length[i], self.status[i], self.seed[i] = 0, scenario.steps, FLYING, scenario.noise_seed
-            samples = self._set_effects(i, scenario)
-            self._set_labels(i, plant.label_changes(scenario))
-            self.tables[i] = (reference, disturbance, *given, samples)
-            self._point(i)
-
-    def _made(self, scenario: FaultScenario, noise: tuple[Array, Array] | None) -> tuple[Array, Array, Array, Any]:
-        """Reference, disturbance, physical parameters and injected noise of a scenario that the plant has accepted."""
-        self.plant.validate(scenario)
-        reference, disturbance, p = self.plant.inputs(scenario)
-        return reference, disturbance, p, (None, None) if noise is None else self._checked_noise(noise, scenario.steps)
-
-    def _checked_noise(self, noise: tuple[Array, Array], steps: int) -> tuple[Array, Array]:
-        w, v = (contiguous(a) for a in noise)
-        wanted = (steps, len(self.plant.states)), (steps + 1, len(self.plant.outputs))
-        if (w.shape, v.shape) != wanted or not (np.isfinite(w).all() and np.isfinite(v).all()):
-            raise ValueError(f"noise is finite and has the shapes {wanted}, not {(w.shape, v.shape)}")
-        return w, v
-
-    def _set_effects(self, i: int, scenario: FaultScenario) -> dict[int, Array]:
-        """The rows of flight i's effects, in the order of listing; returns the tables of those that have one."""
-        plant, rows, samples = self.plant, [], {}
-        for fault in scenario.faults:
-            end = scenario.steps + 1 if fault.end is None else min(fault.end, scenario.steps + 1)
-            for effect in fault.effects:
-                match effect:
-                    case Abrupt(value=value):
-                        what = (closed_loop.ABRUPT, value, 0, 0)
-                    case Incipient(value=value, rate=rate):
-                        what = (closed_loop.INCIPIENT, value, rate, 0)
-                    case Intermittent(value=value, period=period, duty=duty):
-                        what = (closed_loop.INTERMITTENT, value, period, duty)
-                    case Square(value=value, other=other, period=period):
-                        what = (closed_loop.SQUARE, value, period, other)
-                    case Hold(command=command, lag=lag):
-                        what = (closed_loop.HOLD, 0, self._commands[command], lag)
-                    case Samples(values=values):
-                        what = (closed_loop.SAMPLES, 0, len(values), 0)
-                        samples[len(rows)] = np.array(values, float)
-                rows.append((self._entries[effect.entry], fault.onset, end, *what))
-        if len(rows) > self.effects.shape[1]:
-            more = len(rows) - self.effects.shape[1]
-            self.effects = np.pad(self.effects, ((0, 0), (0, more), (0, 0)))
-            self.held, self.values = (np.pad(a, ((0, 0), (0, more))) for a in (self.held, self.values))
-        self.counts[i] = len(rows)
-        if rows:
-            self.effects[i, : len(rows)] = rows
-            for e, row in enumerate(rows):
-                if row[3] == closed_loop.HOLD:  # the command before sample 0, until another is caught
-                    self.held[i, e] = plant.trim_command[row[5]]
-        return samples
-
-    def _set_labels(self, i: int, changes: Sequence[tuple[int, int]]) -> None:
-        if len(changes) >= self.labels.shape[1]:
-            more = len(changes) + 1 - self.labels.shape[1]
-            self.labels = np.pad(self.labels, ((0, 0), (0, more), (0, 0)), constant_values=NEVER)
-        self.labels[i, : len(changes)] = changes
-        self.labels[i, len(changes) :] = NEVER
-
-    def _point(self, i: int) -> None:
-        """Note where flight i's tables lie; they live as long as this does."""
-        *tables, samples = self.tables[i]
-        self.addresses[:, i] = [0 if table is None else table.__array_interface__["data"][0] for table in tables]
-        for e, table in samples.items():
-            self.values[i, e] = table.__array_interface__["data"][0]
-
-    def arrays(self) -> tuple[Array, ...]:
-        """Tables and state in the order of the compiled call."""
-        return (
-            self.seed, self.length, *self.addresses, self.p, self.effects, self.counts, self.values, self.labels,
-            self.k, self.status, self.x, self.c, self.u, self.theta, self.held, self.readings, self.history,
-        )  # fmt: skip
-
-    def blank(self, samples: int) -> Chunk:
-        """An empty chunk of so many samples."""
-        plant, n = self.plant, len(self)
-        widths = len(plant.observed), len(plant.states), len(plant.theta)
-        obs, state, theta = (np.zeros((samples, n, width)) for width in widths)
-        return Chunk(obs, state, theta, np.zeros((samples, n), np.int64))
 
 
 def advance(

@@ -8,20 +8,21 @@ moves the entries of theta that its effects name; outside it they are nominal. T
 from __future__ import annotations
 
 import itertools
-import math
-import re
-import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 
+from fdi_gym.drawing import stream
+from fdi_gym.plain import of_numpy, plain, value_at
+
 MAX_STEPS = 1_000_000  # samples of a flight: what is recorded of it takes a gigabyte or less
 MAX_JSON = 2**25  # bytes of a scenario as text
-MAX_DEPTH = 16  # of lists and dicts within reference, disturbance and physical
+
+DICTS = ("reference", "disturbance", "physical")  # what a plant reads in its own terms
 
 Finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
 Rate = Annotated[float, Meta(gt=0.0, le=1e9)]  # 1/s
@@ -134,17 +135,18 @@ class FaultScenario(_Fields, frozen=True, kw_only=True):
     """
 
     def __post_init__(self) -> None:
-        for name in ("reference", "disturbance", "physical"):
-            msgspec.structs.force_setattr(self, name, plain(getattr(self, name), name))
+        given: dict[str, Any] = {name: getattr(self, name) for name in self.__struct_fields__}
+        dicts = {name: plain(given[name], name) for name in DICTS}
+        typed = {name: value for name, value in given.items() if type(dicts.get(name)) is not dict}
         try:
-            data = msgspec.to_builtins(self, enc_hook=_of_numpy)
+            data = msgspec.to_builtins(typed, enc_hook=of_numpy)
             checked = msgspec.convert(data, _Fields)
         except msgspec.ValidationError as error:
-            raise ValueError(f"not a FaultScenario: {error}{_value_at(str(error), data)}") from None
+            raise ValueError(f"not a FaultScenario: {error}{value_at(str(error), data)}") from None
         except RecursionError:
             raise ValueError("not a FaultScenario: it contains itself") from None
-        for name in ("plant", "steps", "faults", "x0", "noise_seed"):
-            msgspec.structs.force_setattr(self, name, getattr(checked, name))
+        for name in given:
+            msgspec.structs.force_setattr(self, name, dicts[name] if name in dicts else getattr(checked, name))
         _check_windows(checked.faults)
 
     def to_json(self) -> str:
@@ -182,46 +184,6 @@ class FaultScenario(_Fields, frozen=True, kw_only=True):
     def replace(self, **changes: Any) -> FaultScenario:
         """A copy with some fields changed."""
         return msgspec.structs.replace(self, **changes)
-
-
-def _of_numpy(value: Any) -> Any:
-    """NumPy's numbers, strings and arrays as Python's."""
-    if isinstance(value, (np.generic, np.ndarray)) and value.dtype.kind in "biufU":
-        return value.tolist()
-    raise TypeError(f"a scenario holds numbers, strings, lists and dicts, not {type(value).__name__}")
-
-
-def plain(value: Any, where: str, depth: int = 0) -> Any:
-    """A copy of what JSON can say: strings, finite numbers, booleans, None, lists and dicts of them; also from NumPy's.
-
-    Raises:
-        ValueError: Anything else; the message says where.
-    """
-    if value is None or type(value) in (str, bool):
-        return value
-    if type(value) is float or (type(value) is int and abs(value) < 2**63):
-        if math.isfinite(value):
-            return value
-    elif isinstance(value, (np.generic, np.ndarray)) and value.dtype.kind in "biufU":
-        return plain(value.tolist(), where, depth)
-    elif depth >= MAX_DEPTH:
-        raise ValueError(f"{where}: lists and dicts within each other {MAX_DEPTH} deep at most are allowed")
-    elif isinstance(value, (list, tuple)):
-        return [plain(v, f"{where}[{i}]", depth + 1) for i, v in enumerate(value)]
-    elif isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
-        return {str(key): plain(v, f"{where}.{key}", depth + 1) for key, v in value.items()}
-    raise ValueError(f"{where}: strings, finite numbers, lists and dicts of them are allowed, not {reprlib.repr(value)}")
-
-
-def _value_at(message: str, data: Any) -> str:
-    """What stands where a message of msgspec points, as an appendix to it."""
-    path = re.search(r"at `\$(\S+)`$", message)
-    try:
-        for name, index in re.findall(r"\.(\w+)|\[(\d+)\]", path[1] if path else ""):
-            data = data[name or int(index)]
-    except (KeyError, IndexError, TypeError):
-        return ""
-    return f", where there is {reprlib.repr(data)}" if path else ""
 
 
 def _check_windows(faults: list[Fault]) -> None:
@@ -303,25 +265,6 @@ class FaultProcess:
         return replace(self, name="fault-free", description=description, sample=lambda rng: sample(rng).without_faults())
 
 
-class Streams(NamedTuple):
-    """The random streams of one episode. They don't share draws: adding one to a stream leaves the others alone."""
-
-    initial: np.random.SeedSequence
-    scenario: np.random.SeedSequence
-    noise: np.random.SeedSequence
-    physical: np.random.SeedSequence
-
-
-def streams(seed: int) -> Streams:
-    """The random streams that belong to an episode's seed."""
-    return Streams(*(_stream(seed, name) for name in Streams._fields))
-
-
-def _stream(seed: int, name: str) -> np.random.SeedSequence:
-    """One of them: what `SeedSequence(seed).spawn(4)` gives in its place."""
-    return np.random.SeedSequence(seed, spawn_key=(Streams._fields.index(name),))
-
-
 def draw(
     process: FaultProcess,
     seed: int,
@@ -334,60 +277,12 @@ def draw(
         seed: The episode's seed, as given to `reset`.
         perturb: Draws the truth's physical parameters in place of those the process drew.
     """
-    scenario = process.sample(np.random.default_rng(_stream(seed, "scenario")))
+    scenario = process.sample(np.random.default_rng(stream(seed, "scenario")))
     if not isinstance(scenario, FaultScenario):
         raise TypeError(f"the fault process {process.name!r} draws a FaultScenario, not {type(scenario).__name__}")
-    changes: dict[str, Any] = {"noise_seed": int(_stream(seed, "noise").generate_state(1, np.uint64)[0] >> np.uint64(1))}
+    changes: dict[str, Any] = {"noise_seed": int(stream(seed, "noise").generate_state(1, np.uint64)[0] >> np.uint64(1))}
     if process.initial is not None:
-        changes["x0"] = [float(v) for v in process.initial(np.random.default_rng(_stream(seed, "initial")))]
+        changes["x0"] = [float(v) for v in process.initial(np.random.default_rng(stream(seed, "initial")))]
     if perturb is not None:
-        changes["physical"] = dict(perturb(np.random.default_rng(_stream(seed, "physical"))))
+        changes["physical"] = dict(perturb(np.random.default_rng(stream(seed, "physical"))))
     return scenario.replace(**changes)
-
-
-class ThetaTable(NamedTuple):
-    """theta over a flight: on step k, tau seconds after sample k, entry j is a + b exp(-g tau); holds own theirs.
-
-    a, b, g: (K + 1, n_theta). holds: (n_holds, 5) int64, rows (entry, first step, end step, command index, lag).
-    """
-
-    a: np.ndarray
-    b: np.ndarray
-    g: np.ndarray
-    holds: np.ndarray
-
-
-def theta_table(
-    scenario: FaultScenario, nominal: np.ndarray, entries: Sequence[str], commands: Sequence[str], dt: float
-) -> ThetaTable:
-    """What the faults of a scenario that its plant has validated make of theta, step by step."""
-    steps = scenario.steps
-    a = np.tile(np.asarray(nominal, float), (steps + 1, 1))
-    b, g = np.zeros_like(a), np.zeros_like(a)
-    holds: list[tuple[int, int, int, int, int]] = []
-    for fault in scenario.faults:
-        end = steps + 1 if fault.end is None else min(fault.end, steps + 1)
-        if end <= fault.onset:
-            continue  # an empty window, or one after the flight
-        window = slice(fault.onset, end)
-        since = np.arange(window.start, window.stop) - fault.onset
-        for effect in fault.effects:
-            j = entries.index(effect.entry)
-            match effect:
-                case Abrupt(value=value):
-                    a[window, j] = value
-                case Incipient(value=value, rate=rate):
-                    a[window, j] = value
-                    b[window, j] = (nominal[j] - value) * np.exp(-rate * since * dt)
-                    g[window, j] = rate
-                case Intermittent(value=value, period=period, duty=duty):
-                    on = (since * dt / period + 1e-9) % 1.0 < duty
-                    a[window, j] = np.where(on, value, nominal[j])
-                case Square(value=value, other=other, period=period):
-                    half = np.floor(since * dt / (period / 2) + 1e-9)
-                    a[window, j] = np.where(half % 2 == 0, value, other)
-                case Hold(command=command, lag=lag):
-                    holds.append((j, fault.onset, end, commands.index(command), lag))
-                case Samples(values=values):
-                    a[window, j] = np.asarray(values)[np.minimum(since, len(values) - 1)]
-    return ThetaTable(a, b, g, np.array(holds, dtype=np.int64).reshape(-1, 5))

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 
 from fdi_gym.diagnosis import Entry, NotApplicableError, broken_plugins, diagnosers, find_diagnoser, make_diagnoser
 from fdi_gym.diagnosis.registry import GIVEN
+from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.faults import draw
 from fdi_gym.names import blamed, find_module, unknown
-from fdi_gym.plant import load_plant, plant_sources
 from fdi_gym.suite import Suite, load_suite, suite_names
 from fdi_gym.training import trainers
 

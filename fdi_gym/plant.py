@@ -1,8 +1,7 @@
 """What a plant declares: its data sheet (signals, fault modes, labels), its equations, and its fault processes.
 
 A plant file in `fdi_gym/plants/` has the lines `ID = "..."` and `VERSION = ...` and a function `plant(**options)` that
-returns a `Plant`. It is discovered; nothing is listed. A plant outside the package is made known with
-`fdi_gym.register_plant`.
+returns a `Plant`; `fdi_gym/discovery.py` finds it.
 """
 
 from __future__ import annotations
@@ -10,30 +9,20 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
-import inspect
 import itertools
-import math
-import re
 import reprlib
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi_gym.checks import check_declaration, check_scenario, is_whole, twice, unknown
-from fdi_gym.faults import FaultProcess, FaultScenario, ThetaTable, theta_table
+from fdi_gym.checks import check_declaration, check_scenario, twice, unknown
+from fdi_gym.faults import FaultProcess, FaultScenario
+from fdi_gym.model import Array, Model, contiguous
 from fdi_gym.shapes import OPEN, Shapes
-
-Array = np.ndarray
-
-
-def contiguous(a: Any) -> Array:
-    """As the compiled kernels take an array: float64, in C order and writable; a copy only of one that is not."""
-    a = np.ascontiguousarray(a, float)
-    return a if a.flags.writeable else a.copy()
+from fdi_gym.theta import ThetaTable, theta_table
 
 
 class NotApplicableError(ValueError):
@@ -106,7 +95,10 @@ class Kernels(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What a scenario's dicts make: rows (steps + 1, n_r) and (steps + 1, n_d), parameters (n_p,)."""
+    """What a scenario's dicts make: rows (steps + 1, n_r) and (steps + 1, n_d), parameters (n_p,).
+
+    Rows that are the same at every sample are one row, (1, n).
+    """
 
     reference: Array
     disturbance: Array
@@ -176,7 +168,7 @@ class _ByName:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Plant:
+class Plant(Model):
     """A plant's whole declaration. Built by the plant file's `plant(**options)`; plain data, functions and kernels.
 
     A contradiction in it raises ValueError. A plant that `load_plant` built is pickled as its id and options, equals
@@ -206,8 +198,9 @@ class Plant:
         true_feedback: The controller gets the sensors' values before their noise is added; diagnosers never do.
         physical: Maps a scenario's physical parameters to the vector p; of {} it gives the nominal model.
         perturb: Draws physical parameters at a level of mismatch: perturb(rng, level) -> dict, or None if it has none.
-        reference: Maps a scenario to the exogenous reference rows (steps + 1, n_r).
-        disturbance: Maps a scenario to the disturbance rows (steps + 1, n_d).
+        reference: Maps a scenario to the exogenous reference rows (steps + 1, n_r). Of a row that stays the same,
+            `np.broadcast_to(row, (steps + 1, n_r))` is kept once.
+        disturbance: Maps a scenario to the disturbance rows (steps + 1, n_d), likewise.
         measured_disturbance: What the known signals say of the disturbance that is held over an interval:
             measured_disturbance(t, before, now) -> (n, n_d), from its start t [s] and the known signals (n, n_known) at
             its two ends. None where nothing is known of it.
@@ -265,13 +258,13 @@ class Plant:
             object.__setattr__(self, "identification_reward", squared_error([s.scale for s in self.estimated]))
 
     @property
-    def origin(self) -> Origin | None:
-        """How `load_plant` built it; None for a plant made otherwise."""
+    def origin(self) -> Any:
+        """How `load_plant` built it (`fdi_gym.discovery.Origin`); None for a plant made otherwise."""
         return self.__dict__.get("_origin")
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self.origin is not None:
-            return _rebuilt, tuple(self.origin)
+            return self.origin.build, ()
         state = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         state["kernels"] = Kernels(*(f if f is None else _Sent(f) for f in self.kernels))
         return object.__new__, (Plant,), state
@@ -294,26 +287,6 @@ class Plant:
     def observed(self) -> tuple[Signal, ...]:
         """The data sheet of an observation: sensors, the command held up to now, what else is known."""
         return self.outputs + self.commands + self.known
-
-    @functools.cached_property
-    def nominal_theta(self) -> Array:
-        """The healthy fault parameter (n_theta,)."""
-        return np.array([s.nominal for s in self.theta])
-
-    @functools.cached_property
-    def nominal_p(self) -> Array:
-        """The physical parameters of the model that diagnosers get."""
-        return contiguous(self.physical({}))
-
-    @functools.cached_property
-    def trim_command(self) -> Array:
-        """The command before the first sample (n_u,)."""
-        return np.array([s.nominal for s in self.commands])
-
-    @functools.cached_property
-    def trim_state(self) -> Array:
-        """The initial state where a scenario gives none (n_x,)."""
-        return np.array([s.nominal for s in self.states])
 
     @functools.cached_property
     def periods(self) -> Array:
@@ -396,7 +369,7 @@ class Plant:
         """
         rows = scenario.steps + 1
         if self.disturbance is None:
-            d = np.zeros((rows, len(self.disturbances)))
+            d = np.zeros((1, len(self.disturbances)))
         else:
             d = self._made("disturbance", self.disturbance, scenario, (rows, len(self.disturbances)))
         p = self.nominal_p
@@ -406,20 +379,21 @@ class Plant:
 
     def _made(self, name: str, make: Callable[[FaultScenario], Array], scenario: FaultScenario, shape: tuple) -> Array:
         try:
-            made = contiguous(make(scenario))
+            made = np.asarray(make(scenario), float)
         except Exception as error:  # whatever the plant's author did not think of
             what = f"{type(error).__name__}: {error}"
             raise ValueError(f"{name} of a {self.id} scenario, {reprlib.repr(getattr(scenario, name))}: {what}") from error
         fits = made.ndim == len(shape) and all(n in (m, None) for m, n in zip(made.shape, shape, strict=True))
-        if not fits or not np.isfinite(made).all():
+        given = contiguous(made[:1] if fits and made.ndim == 2 and made.strides[0] == 0 else made)  # one row, broadcast
+        if not fits or not np.isfinite(given).all():
             raise ValueError(
                 f"{name} of a {self.id} scenario: the plant makes finite numbers in the shape {shape} of it, not those of "
                 f"{reprlib.repr(getattr(scenario, name))} ({made.shape}{', not all finite' if fits else ''})"
             )
-        return made
+        return given
 
     def theta_table(self, scenario: FaultScenario) -> ThetaTable:
-        """What the scenario makes of theta (see `fdi_gym.faults.theta_table`)."""
+        """What the scenario makes of theta (see `fdi_gym.theta.theta_table`)."""
         return theta_table(scenario, self.nominal_theta, self.theta_entries, self.command_names, self.dt)
 
     def process(self, name: str) -> FaultProcess:
@@ -449,190 +423,3 @@ class Plant:
         lines.append("\nscenarios")
         lines += [f"  {name:20s} {process.description}" for name, process in self.processes.items()]
         return "\n".join(lines)
-
-    # -- the model, as filters use it: compiled, batched, with the nominal physical parameters
-
-    @functools.cached_property
-    def addresses(self) -> tuple[int, ...]:
-        """Addresses of the compiled kernels in the order of `Kernels`, with the defaults where the plant has none."""
-        from fdi_gym import kernels
-
-        given = zip(Kernels._fields, self.kernels, strict=True)
-        return tuple(kernels.address(function or getattr(kernels, role)) for role, function in given)
-
-    def _rows(self, value: Array | None, default: Array) -> Array:
-        rows = default if value is None else np.asarray(value, float)
-        return contiguous(rows.reshape(math.prod(rows.shape[:-1]), rows.shape[-1]))  # also of zero width
-
-    def _rows_of(self, t: Any, x: Array, u: Array, theta: Any, d: Any, p: Any, width: int) -> tuple[Array, ...]:
-        """The arguments of a generic kernel from those of `propagate`, and an array for its output."""
-        points = contiguous(x.reshape(math.prod(x.shape[:-1]), x.shape[-1] if x.ndim else 1))
-        rows = (
-            points,
-            self._rows(u, self.trim_command),
-            self._rows(theta, self.nominal_theta),
-            self._rows(d, np.zeros(len(self.disturbances))),
-            self._rows(p, self.nominal_p),
-        )
-        times = contiguous(np.ravel(t))
-        for name, a, n in zip(("x", "u", "theta", "d", "p"), rows, self._widths, strict=True):
-            if a.shape[1] != n or (len(points) % len(a) if len(a) else len(points)):
-                raise ValueError(f"{name} has {n} columns and rows that serve the {len(points)} points alike, not {a.shape}")
-        if len(points) % times.size if times.size else len(points):
-            raise ValueError(f"t is one number, or serves the {len(points)} points alike, not {times.size} numbers")
-        return times, *rows, np.empty((len(points), width))
-
-    @functools.cached_property
-    def _widths(self) -> tuple[int, ...]:
-        """Of x, u, theta, d and p."""
-        vectors = (self.states, self.commands, self.theta, self.disturbances, self.nominal_p)
-        return tuple(len(vector) for vector in vectors)
-
-    def propagate(
-        self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None, p: Array | None = None
-    ) -> Array:
-        """The state one sample after x (..., n_x), without noise, u, theta and d held: the model's prediction.
-
-        u, theta, d and p may have fewer rows than x: row i of m then serves M/m consecutive points (sigma points of one
-        episode share their command). t [s] is a number or one per such group. theta, d and the physical parameters p
-        default to nominal, none and the model's.
-        """
-        from fdi_gym import integration
-
-        x = np.asarray(x, float)
-        rows = self._rows_of(t, x, u, theta, d, p, len(self.states))
-        integration.propagate(self.addresses[0], self.addresses[4], self.dt, self.substeps, *rows)
-        return rows[-1].reshape(x.shape)
-
-    def measure(
-        self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None, p: Array | None = None
-    ) -> Array:
-        """The noise-free sensor values at x (..., n_x); arguments as in `propagate`, u held up to t."""
-        from fdi_gym import integration
-
-        x = np.asarray(x, float)
-        rows = self._rows_of(t, x, u, theta, d, p, len(self.outputs))
-        integration.evaluate(self.addresses[1], *rows)
-        return rows[-1].reshape(*x.shape[:-1], len(self.outputs))
-
-    def derivative(self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None) -> Array:
-        """xdot at x (..., n_x); arguments as in `propagate`. For a discrete plant it is the next state."""
-        from fdi_gym import integration
-
-        x = np.asarray(x, float)
-        rows = self._rows_of(t, x, u, theta, d, None, len(self.states))
-        integration.evaluate(self.addresses[0], *rows)
-        return rows[-1].reshape(x.shape)
-
-    @functools.cached_property
-    def Q(self) -> Array:
-        """Covariance of the process noise per step (n_x, n_x)."""
-        return np.diag([s.sigma**2 for s in self.states])
-
-    @functools.cached_property
-    def R(self) -> Array:
-        """Covariance of the sensor noise (n_y, n_y)."""
-        return np.diag([s.sigma**2 for s in self.outputs])
-
-
-# ---------------------------------------------------------------------------------------------------------------
-# Discovery
-
-_FOLDER = Path(__file__).parent / "plants"
-
-
-class PlantSource(NamedTuple):
-    """Where a plant comes from: its builder as "module:function", and the version in its environment id."""
-
-    builder: str
-    version: int
-
-
-class Origin(NamedTuple):
-    """What a plant can be built from again, in any process."""
-
-    plant_id: str
-    source: PlantSource
-    options: dict[str, Any]
-
-
-_registered: dict[str, PlantSource] = {}
-
-
-def _package_sources() -> dict[str, PlantSource]:
-    found = {}
-    for path in sorted(_FOLDER.glob("[!_]*.py")):
-        text = path.read_text(encoding="utf-8")
-        name = re.search(r'^ID = "(\w+)"$', text, re.MULTILINE)
-        version = re.search(r"^VERSION = (\d+)$", text, re.MULTILINE)
-        if name and version:
-            found[name[1]] = PlantSource(f"fdi_gym.plants.{path.stem}:plant", int(version[1]))
-    return found
-
-
-def plant_sources() -> dict[str, PlantSource]:
-    """All plants by id, read from the ID and VERSION lines of the plant files: nothing is imported to list them."""
-    return dict(sorted((_package_sources() | _registered).items()))
-
-
-def add_plant_source(plant_id: str, source: PlantSource) -> None:
-    """Make a plant outside the package known; users call `fdi_gym.register_plant`, which registers its environment too.
-
-    Raises:
-        ValueError: The id, version or builder cannot be one, or a plant of the package has the id.
-    """
-    if not isinstance(plant_id, str) or not re.fullmatch(r"\w+", plant_id):
-        raise ValueError(f"a plant's id is a word of letters, digits and underscores, not {plant_id!r}")
-    if not is_whole(source.version) or source.version < 0:
-        raise ValueError(f"{plant_id}: version is a whole number from 0 on, not {source.version!r}")
-    if not isinstance(source.builder, str) or not re.fullmatch(r"\w+(\.\w+)*:\w+", source.builder):
-        raise ValueError(f"{plant_id}: the builder is named as 'module:function', not {source.builder!r}")
-    if plant_id in _package_sources():
-        raise ValueError(f"{plant_id} is a plant of this package; another one needs another id")
-    _registered[plant_id] = source
-
-
-def load_plant(plant_id: str, **options: Any) -> Plant:
-    """Build a plant by id with the options of its data sheet.
-
-    Raises:
-        ValueError: Unknown plant, option or option value (the message lists those that exist), or a builder that does
-            not build the plant it is registered for.
-    """
-    sources = plant_sources()
-    if not isinstance(plant_id, str) or plant_id not in sources:
-        raise ValueError(unknown("plant", plant_id, sources))
-    return _built(plant_id, sources[plant_id], options)
-
-
-def _rebuilt(plant_id: str, source: PlantSource, options: dict[str, Any]) -> Plant:
-    """A plant from its pickle."""
-    return _built(plant_id, source, options)
-
-
-def _built(plant_id: str, source: PlantSource, options: dict[str, Any]) -> Plant:
-    module, function = source.builder.split(":")
-    try:
-        build = getattr(importlib.import_module(module), function)
-        parameters = inspect.signature(build).parameters
-    except Exception as error:
-        what = f"{type(error).__name__}: {error}"
-        raise ValueError(f"{plant_id}: its builder {source.builder!r} cannot be imported: {what}") from error
-    named = [n for n, p in parameters.items() if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
-        for option in options:
-            if option not in named:
-                raise ValueError(unknown("option", option, named, plant_id))
-    try:
-        plant = build(**options)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{plant_id} with the options {options}: {error}") from error
-    except Exception as error:
-        what = f"{type(error).__name__}: {error}"
-        raise ValueError(f"{plant_id}: its builder {source.builder!r} fails with the options {options}: {what}") from error
-    if not isinstance(plant, Plant) or (plant.id, plant.version) != (plant_id, source.version):
-        made = f"the plant {plant.env_id}" if isinstance(plant, Plant) else repr(plant)
-        raise ValueError(f"{source.builder!r} is registered for {plant_id}-Faults-v{source.version}, but returns {made}")
-    defaults = {n: parameters[n].default for n in named}
-    object.__setattr__(plant, "_origin", Origin(plant_id, source, {**defaults, **options}))
-    return plant

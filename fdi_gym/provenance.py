@@ -23,12 +23,13 @@ import platformdirs
 from fdi_gym.diagnosis import diagnosers, find_diagnoser, make_diagnoser
 from fdi_gym.diagnosis.knowledge import knowledge_of
 from fdi_gym.diagnosis.registry import package_of
+from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.engine import simulate
 from fdi_gym.estimation.data import digest
 from fdi_gym.faults import draw
 from fdi_gym.metrics import outcome
 from fdi_gym.names import blamed
-from fdi_gym.plant import Plant, load_plant, plant_sources
+from fdi_gym.plant import Plant
 
 _LIBRARIES = tuple(Path(p).resolve() for p in {*sysconfig.get_paths().values(), sys.prefix, sys.base_prefix})
 _SYSTEM = tuple(Path(p) for p in ("/proc", "/sys", "/dev", "/etc"))

@@ -15,11 +15,21 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box, Discrete, Space
 
+from fdi_gym.discovery import load_plant
 from fdi_gym.faults import FaultScenario, draw
-from fdi_gym.plant import Array, Plant, Signal, load_plant
+from fdi_gym.plant import Array, Plant, Signal
 
 TASKS = ("isolation", "identification")
 UNITS = ("physical", "scaled")
+
+# Samples that are flown ahead of the agent: few after a reset, since an episode may be short, and twice as many each time.
+# `python benchmarks/engine.py --chunks` measures what the two cost.
+FIRST, CHUNK = 16, 128
+
+
+def ahead(before: int, period: int) -> int:
+    """Samples to fly next, after so many: a multiple of the decision period."""
+    return period * -(-min(max(2 * before, FIRST), CHUNK) // period)
 
 
 def whole(name: str, value: Any, least: int) -> int:

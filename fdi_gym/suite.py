@@ -14,10 +14,11 @@ from typing import Any
 import msgspec
 
 from fdi_gym.diagnosis import find_diagnoser
+from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.files import RefusedError, digest, pretty, read_json, write_whole
 from fdi_gym.names import blame, check_diagnoser_name, check_name, find_function, find_module, unknown
-from fdi_gym.plant import Plant, load_plant, plant_sources
+from fdi_gym.plant import Plant
 
 _PACKAGED = Path(__file__).parent / "suites"
 _CHECKOUT = Path(__file__).parent.parent / "leaderboards" / "suites"

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from fdi_gym.diagnosis import filtering, fitting, knowledge
+from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.engine import simulate
 from fdi_gym.estimation.decision import Rule, Verdict
-from fdi_gym.plant import Plant, load_plant, plant_sources
+from fdi_gym.plant import Plant
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "examples"))

@@ -11,9 +11,9 @@ from benchmarks.reproduction.cmg_satellite.outcomes import Said, hard_outcome, w
 from benchmarks.reproduction.cmg_satellite.plan import GRIDS, LEVELS, blocks, is_campaign
 from benchmarks.reproduction.cmg_satellite.results import Results
 from benchmarks.reproduction.pieces import pieces
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
 from fdi_gym.faults import FaultScenario
-from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
 
 

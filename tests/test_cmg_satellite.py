@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import fdi_gym
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import no_noise, simulate
 from fdi_gym.faults import Fault, FaultScenario, Samples, draw
-from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
 
 DELTA = np.array([0.3, -0.2, 0.5, 0.1])

@@ -11,10 +11,10 @@ from baselines.filters.mekf import observation, transition
 from baselines.oracles.cramer_rao_oracle import cramer_rao_oracle, log_evidence
 from baselines.oracles.mekf_clairvoyant import changes
 from fdi_gym.diagnosis import NotApplicableError, make_diagnoser, run
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
 from fdi_gym.estimation.sigma_points import cholesky, covariance, mean_and_deviations, unscented_points, weights
 from fdi_gym.faults import FaultScenario
-from fdi_gym.plant import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
 
 Q_V, W, DELTA = [0.1, -0.2, 0.3], [0.05, -0.02, 0.03], [0.3, -0.2, 0.5, 0.1]

@@ -10,6 +10,7 @@ import pytest
 from conftest import ROOT, build
 
 from fdi_gym import integration, kernels
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import no_noise, simulate, white_noise
 from fdi_gym.faults import (
     Abrupt,
@@ -25,7 +26,6 @@ from fdi_gym.faults import (
     streams,
     theta_table,
 )
-from fdi_gym.plant import load_plant
 from fdi_gym.plants import b747_lateral as b747
 
 MOTOR = {"reference": {"levels": [100.0]}, "disturbance": {"load": 0.02}}
@@ -217,7 +217,7 @@ def test_a_changed_helper_is_never_answered_by_old_code(tmp_path):
 
 def test_an_unwritable_cache_only_costs_time(tmp_path):
     (tmp_path / "file").write_text("")
-    code = "from fdi_gym.plant import load_plant; print(load_plant('B747Lateral').env_id)"
+    code = "from fdi_gym.discovery import load_plant; print(load_plant('B747Lateral').env_id)"
     assert run_python(code, FDI_GYM_CACHE_DIR=str(tmp_path / "file" / "cache")) == "B747Lateral-Faults-v0"
 
 

@@ -14,8 +14,9 @@ from conftest import build
 from scipy import stats
 
 from fdi_gym import closed_loop, noise
-from fdi_gym.engine import Chunk, Flights, advance, no_noise, simulate, white_noise
+from fdi_gym.engine import advance, no_noise, simulate, white_noise
 from fdi_gym.faults import Abrupt, Fault, Hold, Samples, draw
+from fdi_gym.flights import Chunk, Flights
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -366,7 +367,7 @@ FLY = """
 import numpy as np
 from fdi_gym.engine import simulate
 from fdi_gym.faults import draw
-from fdi_gym.plant import load_plant
+from fdi_gym.discovery import load_plant
 plant = load_plant("B747Lateral")
 print(simulate(plant, [draw(plant.process("standard"), 1).replace(steps=20, faults=[])]).obs.tobytes().hex()[-64:])
 """

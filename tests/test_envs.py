@@ -12,11 +12,13 @@ from conftest import build
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
-from fdi_gym.envs import CHUNK, FDIEnv, FDIVectorEnv
+from fdi_gym.envs import FDIEnv
 from fdi_gym.faults import FaultScenario, draw
-from fdi_gym.plant import load_plant
 from fdi_gym.plants import b747_lateral as b747
+from fdi_gym.rules import CHUNK
+from fdi_gym.vector_envs import FDIVectorEnv
 
 
 def play(env, policy, seed=None):

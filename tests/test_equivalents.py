@@ -8,11 +8,11 @@ import pytest
 
 from fdi_gym.diagnosis import diagnosers, run
 from fdi_gym.diagnosis.fitting import fit_belief
+from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.engine import simulate
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.equivalent import has_equivalents, nearest
 from fdi_gym.faults import draw
-from fdi_gym.plant import load_plant, plant_sources
 
 PLANTS = [load_plant(name) for name in plant_sources()]
 DECLARING = [plant for plant in PLANTS if has_equivalents(plant)]

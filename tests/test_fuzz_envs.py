@@ -8,9 +8,10 @@ import pytest
 from conftest import PLANTS, build
 from gymnasium.vector import AutoresetMode
 
-from fdi_gym.envs import FDIEnv, FDIVectorEnv
+from fdi_gym.envs import FDIEnv
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.sb3 import FDIVecEnv
+from fdi_gym.vector_envs import FDIVectorEnv
 
 N = 3
 DOCUMENTED = (ValueError, TypeError, RuntimeError)  # RuntimeError: no episode has begun, or it is over

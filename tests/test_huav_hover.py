@@ -9,9 +9,9 @@ from gymnasium.utils.env_checker import check_env
 
 import fdi_gym  # noqa: F401 (registers the environments)
 from benchmarks.reproduction.numbered import fly
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import no_noise, simulate
 from fdi_gym.faults import FaultScenario
-from fdi_gym.plant import load_plant
 from fdi_gym.plants import huav_hover as huav
 
 KAPPAS = (0.0, 0.3, 1.0)

@@ -13,6 +13,7 @@ from baselines.oracles.matched_oracle import steady_filter
 from benchmarks.reproduction.numbered import fly
 from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, guarded, run
 from fdi_gym.diagnosis.filtering import readings
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import no_noise, simulate
 from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.belief import Belief, fault_inputs
@@ -22,7 +23,7 @@ from fdi_gym.estimation.labels import channel_sets, label_of_channels
 from fdi_gym.estimation.linear import linear_output
 from fdi_gym.faults import FaultProcess, FaultScenario
 from fdi_gym.kernels import kernel
-from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal, load_plant
+from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
 from fdi_gym.plants import b747_lateral, huav_hover
 from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env
 

@@ -20,7 +20,7 @@ from baselines.networks.identification import Shape
 from baselines.networks.network import SequenceNetwork, loss
 from baselines.networks.supervised import Recipe, Run
 from fdi_gym.diagnosis import NotApplicableError, make_diagnoser, run
-from fdi_gym.plant import load_plant
+from fdi_gym.discovery import load_plant
 from fdi_gym.suite import load_suite, suite_names
 from fdi_gym.testing import check_diagnoser
 from fdi_gym.training import find_trainer, trainers

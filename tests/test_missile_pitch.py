@@ -6,9 +6,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from baselines.filters import missile_model as model
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import no_noise, simulate
 from fdi_gym.faults import FaultScenario, draw
-from fdi_gym.plant import load_plant
 from fdi_gym.plants import missile_pitch as missile
 
 DEG = np.pi / 180

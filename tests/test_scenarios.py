@@ -15,6 +15,7 @@ import pytest
 from conftest import PLANTS, ROOT, build
 
 import fdi_gym
+from fdi_gym.discovery import PlantSource, load_plant, plant_sources
 from fdi_gym.engine import no_noise, simulate
 from fdi_gym.envs import FDIEnv
 from fdi_gym.faults import (
@@ -31,9 +32,10 @@ from fdi_gym.faults import (
     Square,
     draw,
 )
-from fdi_gym.plant import Kernels, Label, PlantSource, load_plant, plant_sources
+from fdi_gym.plant import Kernels, Label
 from fdi_gym.shapes import OPEN
-from fdi_gym.testing import _check_range, check_plant
+from fdi_gym.testing import check_plant
+from fdi_gym.testing.plants import _check_range
 
 NAN, INF = math.nan, math.inf
 VARIANTS = (
@@ -491,21 +493,21 @@ def test_a_wrong_name_or_option_says_what_exists(plant_id, options, match):
 
 @pytest.mark.parametrize(("body", "match"), [
     ("raise RuntimeError('no licence')", "no licence"), ("return None", "returns None"),
-    ("from fdi_gym.plant import load_plant; return load_plant('B747Lateral')", "returns the plant B747Lateral"),
+    ("from fdi_gym.discovery import load_plant; return load_plant('B747Lateral')", "returns the plant B747Lateral"),
     ("return undefined", "NameError"), ("import nowhere_to_be_found", "nowhere_to_be_found"),
 ])  # fmt: skip
 def test_a_broken_builder_is_named(tmp_path, monkeypatch, body, match):
     (tmp_path / "broken_plant.py").write_text(f"def build():\n    {body}\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "broken_plant", raising=False)
-    monkeypatch.setattr("fdi_gym.plant._registered", {"Broken": PlantSource("broken_plant:build", 0)})
+    monkeypatch.setattr("fdi_gym.discovery._registered", {"Broken": PlantSource("broken_plant:build", 0)})
     with pytest.raises(ValueError, match=match):
         load_plant("Broken")
 
 
 @pytest.mark.parametrize("builder", ["nowhere_to_be_found:plant", "dc_motor:nothing", "dc_motor:DT"])
 def test_a_builder_that_is_not_there_is_named(monkeypatch, builder):
-    monkeypatch.setattr("fdi_gym.plant._registered", {"Broken": PlantSource(builder, 0)})
+    monkeypatch.setattr("fdi_gym.discovery._registered", {"Broken": PlantSource(builder, 0)})
     with pytest.raises(ValueError, match=builder):
         load_plant("Broken")
 

@@ -8,8 +8,8 @@ from baselines.filters.unknown_inputs import known_of
 from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, run
 from fdi_gym.diagnosis.filtering import readings
 from fdi_gym.diagnosis.fitting import fit_belief, flights_of
+from fdi_gym.discovery import load_plant
 from fdi_gym.estimation.calibration import Calibration
-from fdi_gym.plant import load_plant
 
 FAMILY = ("ascdkf", "three_stage_cdkf", "three_stage_ekf")
 

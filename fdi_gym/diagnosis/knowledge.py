@@ -23,12 +23,13 @@ import msgspec
 
 from fdi_gym.diagnosis.fitting import fit_belief, fit_calibration
 from fdi_gym.diagnosis.registry import Entry, find_diagnoser, package_of
+from fdi_gym.discovery import plant_sources
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.data import from_json, to_json
 from fdi_gym.files import write_whole
 from fdi_gym.kernels import cache_folder
-from fdi_gym.plant import NotApplicableError, Plant, plant_sources
+from fdi_gym.plant import NotApplicableError, Plant
 
 
 class Fits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

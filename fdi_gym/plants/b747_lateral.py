@@ -34,6 +34,7 @@ Version history: v0, the first.
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -42,6 +43,7 @@ import numpy as np
 import scipy.linalg
 from msgspec import UNSET, Meta, UnsetType
 
+from fdi_gym.drawing import uniform
 from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Hold, Scoring
 from fdi_gym.kernels import kernel
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
@@ -56,6 +58,7 @@ SIGMA_V = (0.10, 0.05, 0.05, 0.10)  # deg, deg/s, deg/s, deg: sensors
 SIGMA_W = (0.02, 0.03, 0.02, 0.002)  # deg, deg/s, deg/s, deg per step: process
 U_MAX = (20.0, 4.0)  # deg: command limit and travel of aileron, rudder
 SURFACES = ("aileron", "rudder")
+UP_TO_LOSS, UP_TO_JAM = 0.5, 0.7  # shares of the faults, added up: loss of effectiveness, jam, stuck anywhere
 
 A_PRINTED = np.array([
     [-0.08895, 0.06282, -0.9795, 0.04362],
@@ -72,6 +75,8 @@ LQR = {
 }
 B_STUCK_MAX = {"printed": (4.0, 2.0), "bare": (4.0, 0.8)}  # deg: random stuck position of aileron, rudder
 VARIANTS = ("printed/open", "printed/closed", "bare/closed")
+
+CALM = np.zeros(1)  # deg: no gust
 
 MULTISINE_AMPLITUDE = np.array([[1.2, 0.9, 0.6], [0.5, 0.4, 0.3]])  # deg
 MULTISINE_OMEGA = np.array([[0.35, 0.75, 1.30], [0.25, 0.60, 1.05]])  # rad/s
@@ -225,29 +230,27 @@ def reference_rows(scenario: FaultScenario) -> np.ndarray:
     rows[:, :2] = excitation(scenario.reference, steps)
     levels = scenario.reference.get("bank_levels", [0.0])
     if any(levels):
-        a, s = np.exp(-DT / 2.0), 0.0
-        for k in range(steps + 1):
-            s = a * s + (1 - a) * levels[min(k // 150, len(levels) - 1)]
-            rows[k, 2] = s
+        a, last = float(np.exp(-DT / 2.0)), len(levels) - 1
+        inputs = ((1 - a) * levels[min(k // 150, last)] for k in range(steps + 1))
+        rows[:, 2] = list(itertools.accumulate(inputs, lambda s, e: a * s + e, initial=0.0))[1:]
     return rows
 
 
 def gust_rows(scenario: FaultScenario) -> np.ndarray:
     """d (steps + 1, 1): one gust, 1 - cos up in `rise` s from t0 to size [deg], `hold` s there, and down again."""
-    d = np.zeros((scenario.steps + 1, 1))
-    if scenario.disturbance:
-        t0, rise, size, hold = (scenario.disturbance[name] for name in ("t0", "rise", "size", "hold"))
-        s = np.arange(scenario.steps + 1) * DT - t0
-        up, down = (0.5 * (1 - np.cos(np.pi * np.clip(x / rise, 0, 1))) for x in (s, s - rise - hold))
-        d[:, 0] = size * (up - down)
-    return d
+    if not scenario.disturbance:
+        return np.broadcast_to(CALM, (scenario.steps + 1, 1))
+    t0, rise, size, hold = (scenario.disturbance[name] for name in ("t0", "rise", "size", "hold"))
+    s = np.arange(scenario.steps + 1) * DT - t0
+    up, down = (0.5 * (1 - np.cos(np.pi * np.clip(x / rise, 0, 1))) for x in (s, s - rise - hold))
+    return (size * (up - down))[:, None]
 
 
 def draw_reference(rng: np.random.Generator, low: float, high: float, closed: bool) -> dict[str, Any]:
     """A multisine with a common activity U(low, high) and free phases; in the closed loop also bank levels U(-8, 8) deg."""
     reference: dict[str, Any] = {
         "command": "multisine",
-        "scale": float(rng.uniform(low, high)),
+        "scale": uniform(rng, low, high),
         "phases": rng.uniform(0, 2 * np.pi, (2, 3)).tolist(),
     }
     if closed:
@@ -291,10 +294,10 @@ def processes(airframe: str, closed: bool, dual: bool) -> list[FaultProcess]:
     b_max = B_STUCK_MAX[airframe]
 
     def fault(rng: np.random.Generator, i: int, onset: int, end: int | None, gamma: tuple[float, float]) -> Fault:
-        kind = rng.choice(3, p=[0.5, 0.2, 0.3])
-        if kind == 0:
-            return loss(SURFACES[i], float(rng.uniform(*gamma)), onset, end)
-        return stuck(SURFACES[i], None if kind == 1 else float(rng.uniform(-b_max[i], b_max[i])), onset, end)
+        kind = rng.random()
+        if kind < UP_TO_LOSS:
+            return loss(SURFACES[i], uniform(rng, *gamma), onset, end)
+        return stuck(SURFACES[i], None if kind < UP_TO_JAM else uniform(rng, -b_max[i], b_max[i]), onset, end)
 
     def flight(rng: np.random.Generator, faults: list[Fault], low: float = 0.5, high: float = 1.5) -> FaultScenario:
         return FaultScenario(plant=ID, steps=STEPS, faults=faults, reference=draw_reference(rng, low, high, closed))

@@ -48,6 +48,8 @@ Version history: v0, the first.
 
 from __future__ import annotations
 
+import bisect
+import itertools
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -57,6 +59,7 @@ import scipy.linalg
 from msgspec import UNSET, Meta, UnsetType
 
 from fdi_gym.checks import number
+from fdi_gym.drawing import random_sign, uniform
 from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Hold, Samples, Scoring, Square
 from fdi_gym.kernels import kernel
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
@@ -281,6 +284,11 @@ BIAS = ((1e-3, 12e-3), (0.4e-3, 6e-3), (0.3e-3, 6e-3), (2e-3, 15e-3))  # rad, lo
 STUCK = (6e-3, 3e-3, 3e-3, 8e-3)  # rad, about trim
 SQUARE = ((2e-3, 12e-3), (1e-3, 6e-3), (1e-3, 6e-3), (3e-3, 12e-3))  # rad
 DRIFT = ((2e-3, 10e-3), (1e-3, 5e-3), (1e-3, 5e-3), (3e-3, 10e-3))  # rad, standard deviation
+GUSTS = ((1, 14), (1, 3), (0, 5), (-4, 4))  # s: start, rise, hold; m/s: speed
+UP_TO_COUNT, UP_TO_KIND = (0.15, 0.15 + 0.65), (0.4, 0.4 + 0.2, 0.4 + 0.2 + 0.2)  # shares of flights, of faults, added up
+LOG_BIAS = tuple(np.log(bounds).tolist() for bounds in BIAS)
+DRIFT_DECAY = float(np.exp(-DT / 0.5))  # over a sample; and the share of the standard deviation that is new
+DRIFT_NEW = float(np.sqrt(1 - np.exp(-DT / 0.5) ** 2))
 LOSS = ((0.85, 0.98), (0.2, 0.7), (0.2, 0.7), (0.2, 0.7))  # gain that is left
 
 
@@ -354,20 +362,27 @@ def gust(t0: float, rise: float, speed: float, hold: float | None = None) -> dic
     return {"t0": float(t0), "rise": float(rise), "speed": float(speed), "hold": None if hold is None else float(hold)}
 
 
+CALM = np.zeros(2)  # m/s: no gusts
 PAPER_GUSTS = {"u_g": gust(2.0, 2.0, 4.0), "v_g": gust(5.0, 2.0, 3.0)}
 
 
 def disturbance_rows(scenario: FaultScenario) -> np.ndarray:
     """d (steps + 1, 2): the gust at the samples."""
+    if not scenario.disturbance:
+        return np.broadcast_to(CALM, (scenario.steps + 1, 2))
     d = np.zeros((scenario.steps + 1, 2))
     t = np.arange(scenario.steps + 1) * DT
     for name, g in scenario.disturbance.items():
-        rise, speed = g["rise"], g["speed"]
+        rise, speed, column = g["rise"], g["speed"], d[:, ("u_g", "v_g").index(name)]
         s = t - g["t0"]
-        fall = np.full_like(s, -1.0) if g["hold"] is None else s - rise - g["hold"]
-        up = speed / 2 * (1 - np.cos(np.pi * np.clip(s / rise, 0, 1)))
-        down = np.where(fall < rise, speed / 2 * (1 + np.cos(np.pi * np.clip(fall / rise, 0, 1))), 0.0)
-        d[:, ("u_g", "v_g").index(name)] = np.where(fall > 0, down, up)
+        first, held = s.searchsorted((0.0, rise), "right")
+        column[first:held] = speed / 2 * (1 - np.cos(np.pi * (s[first:held] / rise)))
+        column[held:] = speed
+        if g["hold"] is not None:
+            fall = s - rise - g["hold"]
+            first, over = fall.searchsorted(0.0, "right"), fall.searchsorted(rise, "left")
+            column[first:over] = speed / 2 * (1 + np.cos(np.pi * (fall[first:over] / rise)))
+            column[over:] = 0.0
     return d
 
 
@@ -384,38 +399,36 @@ def paper(number: int = 1) -> FaultScenario:
 
 def sample(rng: np.random.Generator) -> FaultScenario:
     """A flight of the randomised process. The order of draws is part of the benchmark; magnitudes in rad."""
-    count = int(rng.choice(3, p=[0.15, 0.65, 0.20]))
+    count = bisect.bisect_right(UP_TO_COUNT, rng.random())
     faults = []
     for c in rng.permutation(4)[:count]:
         channel, centre = CHANNELS[c], float(U_TRIM[c])
-        kind = int(rng.choice(4, p=[0.4, 0.2, 0.2, 0.2]))
-        k0 = round(rng.uniform(3, 12) / DT)
-        duration = rng.uniform(2, 6)
+        kind = bisect.bisect_right(UP_TO_KIND, rng.random())
+        k0 = round(uniform(rng, 3, 12) / DT)
+        duration = uniform(rng, 2, 6)
         k1 = STEPS if rng.random() < 0.3 else min(STEPS, k0 + round(duration / DT))
         if kind == 0:
-            sign = float(rng.choice([-1, 1]))
-            faults.append(bias(channel, sign * np.exp(rng.uniform(*np.log(BIAS[c]))), k0, k1))
+            sign = random_sign(rng)
+            faults.append(bias(channel, sign * np.exp(uniform(rng, *LOG_BIAS[c])), k0, k1))
         elif kind == 1:
-            position = None if rng.random() < 0.5 else centre + rng.uniform(-1, 1) * STUCK[c]
+            position = None if rng.random() < 0.5 else centre + uniform(rng, -1, 1) * STUCK[c]
             faults.append(stuck(channel, position, k0, k1))
         elif kind == 2 and rng.random() < 0.5:
-            amplitude, period = rng.uniform(*SQUARE[c]), rng.uniform(0.6, 2)
-            amplitude = float(rng.choice([-1, 1])) * amplitude
+            amplitude, period = uniform(rng, *SQUARE[c]), uniform(rng, 0.6, 2)
+            amplitude = random_sign(rng) * amplitude
             faults.append(floating_square(channel, centre + amplitude, centre - amplitude, period, k0, k1))
         elif kind == 2:
-            sigma = rng.uniform(*DRIFT[c])
-            s, a = sigma * rng.standard_normal(), np.exp(-DT / 0.5)
-            positions = []
-            for e in rng.standard_normal(k1 - k0):
-                positions.append(centre + s)
-                s = a * s + sigma * np.sqrt(1 - a**2) * e
-            faults.append(floating(channel, positions, k0, k1))
+            sigma = uniform(rng, *DRIFT[c])
+            first = sigma * rng.standard_normal()
+            news = (sigma * DRIFT_NEW * rng.standard_normal(k1 - k0)).tolist()
+            drift = itertools.accumulate(news[:-1], lambda s, new: DRIFT_DECAY * s + new, initial=first)
+            faults.append(floating(channel, [centre + s for s in drift], k0, k1))
         else:
-            faults.append(loss(channel, rng.uniform(*LOSS[c]), k0, k1))
+            faults.append(loss(channel, uniform(rng, *LOSS[c]), k0, k1))
     gusts = {}
     for name in ("u_g", "v_g"):
         if rng.random() < 0.7:
-            t0, rise, hold, speed = rng.uniform(1, 14), rng.uniform(1, 3), rng.uniform(0, 5), rng.uniform(-4, 4)
+            t0, rise, hold, speed = (uniform(rng, *bounds) for bounds in GUSTS)
             gusts[name] = gust(t0, rise, speed, hold)
     return FaultScenario(plant=ID, steps=STEPS, faults=faults, disturbance=gusts)
 

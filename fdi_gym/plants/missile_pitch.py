@@ -54,6 +54,7 @@ import scipy.linalg
 from msgspec import UNSET, Meta, UnsetType
 
 from fdi_gym.checks import number
+from fdi_gym.drawing import random_sign, uniform
 from fdi_gym.faults import MAX_STEPS, Abrupt, Fault, FaultProcess, FaultScenario, Incipient, Scoring
 from fdi_gym.kernels import kernel
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
@@ -88,6 +89,7 @@ I_MAX = 30.0  # rad/s^2: limit of the fast loop's integral
 JET_SHARE = 0.5  # of the desired pitch acceleration
 
 MACH = 2.5  # of the study's scenario
+LOG_RATE, LOG_RATE_HARD = np.log([0.15, 2.0]).tolist(), np.log([0.5, 3.0]).tolist()  # of 1/s: how fast a fault grows
 ALPHA_MAX, Q_MAX = 20 * DEG, 5.0  # rad, rad/s: validity of the airframe data; loss of control
 MODES = ("aero", "leak", "finloss", "stuck", "jetloss")  # labels 1 to 5
 ENTRIES = ("theta_aero", "theta_leak", "theta_finloss", "jam", "theta_jetloss")
@@ -250,22 +252,25 @@ def mach_of(scenario: FaultScenario) -> tuple[float, float]:
 def reference_rows(scenario: FaultScenario) -> np.ndarray:
     """r_k = (alpha_c [rad], M): the commanded incidence, a sine or a staircase, and the Mach number."""
     k = np.arange(scenario.steps + 1)
+    rows = np.zeros((k.size, 2))
     wanted = scenario.reference
     if wanted.get("command", "zero") == "sine":
-        alpha_c = wanted["amplitude"] * np.sin(2 * np.pi * k * DT / wanted["period"])
+        rows[:, 0] = wanted["amplitude"] * np.sin(2 * np.pi * k * DT / wanted["period"]) * DEG
     elif wanted.get("command") == "levels":
-        levels = np.array(wanted["levels"], float)  # the last one stays
-        alpha_c = levels[np.minimum(np.searchsorted(np.cumsum(wanted["holds"]), k, side="right"), levels.size - 1)]
-    else:
-        alpha_c = np.zeros(k.size)
+        start = 0
+        for level, hold in zip(wanted["levels"], wanted["holds"], strict=True):
+            rows[start : start + hold, 0] = level * DEG
+            start += hold
+        rows[start:, 0] = wanted["levels"][-1] * DEG  # the last one stays
     first, last = mach_of(scenario)
-    return np.column_stack([alpha_c * DEG, first + (last - first) * k / scenario.steps])
+    rows[:, 1] = first + (last - first) * k / scenario.steps
+    return rows
 
 
 def disturbance_rows(scenario: FaultScenario) -> np.ndarray:
     """d_k = (M(0) - 2.5, dM/dt), the same at every sample: the integrator needs M at its stages."""
     first, last = mach_of(scenario)
-    return np.tile([first - MACH, (last - first) / (scenario.steps * DT)], (scenario.steps + 1, 1))
+    return np.broadcast_to([first - MACH, (last - first) / (scenario.steps * DT)], (scenario.steps + 1, 2))
 
 
 def measured_disturbance(t: float, before: np.ndarray, now: np.ndarray) -> np.ndarray:
@@ -304,16 +309,16 @@ def study(label: int = 1, size: float = 0.75, rate: float = 0.2, steps: int = ST
 def sample_standard(rng: np.random.Generator, fault_scale: float = 1.0) -> FaultScenario:
     """The randomised process: one permanent fault or none. The order of the draws is part of the data sheet."""
     label = int(rng.integers(0, 6))
-    onset = round(rng.uniform(4, 16) / DT)
-    u = rng.uniform()
-    sign = rng.choice([-1.0, 1.0])
-    rate = float(np.exp(rng.uniform(np.log(0.15), np.log(2))))
+    onset = round(uniform(rng, 4, 16) / DT)
+    u = rng.random()
+    sign = random_sign(rng)
+    rate = float(np.exp(uniform(rng, *LOG_RATE)))
     size = {1: sign * (0.1 + 0.6 * u), 2: sign * (0.1 + 0.6 * u), 3: 0.05 + 0.35 * u, 5: 0.3 + 0.7 * u}.get(label, 0.0)
-    size = float(size) * fault_scale
+    size = size * fault_scale
     if label == 5:  # its parameter set ends at the whole jet
         size = min(size, 1.0)
-    mach = rng.uniform(1.5, 3)
-    mach = [float(mach), float(max(1.5, mach - rng.uniform(0, 0.5)))]
+    mach = uniform(rng, 1.5, 3)
+    mach = [mach, max(1.5, mach - uniform(rng, 0, 0.5))]
     rho = rng.uniform(-0.05, 0.05, 6).tolist()
     faults = [fault(label, size, rate, onset)] if label else []
     return FaultScenario(
@@ -325,8 +330,8 @@ def _levels(rng: np.random.Generator) -> dict[str, Any]:
     """A staircase of commanded incidence: holds of U(1.5, 4) s, zero in 30 % of them, else U(-12, 12) deg."""
     k, levels, holds = 0, [], []
     while k < STEPS + 1:
-        holds.append(round(rng.uniform(1.5, 4) / DT))
-        levels.append(0.0 if rng.uniform() < 0.3 else float(rng.uniform(-12, 12)))
+        holds.append(round(uniform(rng, 1.5, 4) / DT))
+        levels.append(0.0 if rng.random() < 0.3 else uniform(rng, -12, 12))
         k += holds[-1]
     return {"command": "levels", "levels": levels, "holds": holds}
 
@@ -335,16 +340,16 @@ def sample_hard(rng: np.random.Generator, fault_scale: float = 1.0) -> FaultScen
     """Two windows with a fault each, none in 10 % of the flights; a plant further off the model than is told."""
     faults = []
     if rng.random() >= 0.1:
-        onset = round(rng.uniform(3, 5) / DT)
+        onset = round(uniform(rng, 3, 5) / DT)
         for _ in range(2):
-            end = onset + round(rng.uniform(2.5, 4.5) / DT)
-            label, u, sign = int(rng.integers(1, 6)), rng.random(), rng.choice([-1.0, 1.0])
+            end = onset + round(uniform(rng, 2.5, 4.5) / DT)
+            label, u, sign = int(rng.integers(1, 6)), rng.random(), random_sign(rng)
             size = {1: sign * (0.08 + 0.22 * u), 2: sign * (0.08 + 0.22 * u), 3: 0.05 + 0.15 * u, 5: 0.15 + 0.3 * u}
-            rate = float(np.exp(rng.uniform(np.log(0.5), np.log(3))))
-            faults.append(fault(label, float(size.get(label, 0.0)) * fault_scale, rate, onset, end))
-            onset = end + round(rng.uniform(2.5, 4) / DT)
-    mach = rng.uniform(1.5, 3)
-    mach = [float(mach), float(max(1.5, mach - rng.uniform(0, 0.5)))]
+            rate = float(np.exp(uniform(rng, *LOG_RATE_HARD)))
+            faults.append(fault(label, size.get(label, 0.0) * fault_scale, rate, onset, end))
+            onset = end + round(uniform(rng, 2.5, 4) / DT)
+    mach = uniform(rng, 1.5, 3)
+    mach = [mach, max(1.5, mach - uniform(rng, 0, 0.5))]
     return FaultScenario(
         plant=ID, steps=STEPS, faults=faults, reference=_levels(rng), disturbance={"mach": mach},
         physical=perturb(rng, 0.08),

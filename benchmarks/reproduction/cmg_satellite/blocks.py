@@ -15,7 +15,8 @@ from benchmarks.reproduction.numbered import fly
 from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.engine import Record
 from fdi_gym.faults import FaultScenario
-from fdi_gym.plant import Plant, load_plant
+from fdi_gym.discovery import load_plant
+from fdi_gym.plant import Plant
 from fdi_gym.plants import cmg_satellite as cmg
 
 SIGMA_R = ", sigma_R 1e-4"  # the source's R in place of the true one

@@ -14,7 +14,7 @@ from benchmarks.reproduction.numbered import fly
 from benchmarks.reproduction.pieces import Jobs, reference
 from fdi_gym.engine import simulate, white_noise
 from fdi_gym.faults import FaultScenario
-from fdi_gym.plant import load_plant
+from fdi_gym.discovery import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
 
 REFERENCE = reference("cmg_satellite")

@@ -14,7 +14,8 @@ from fdi_gym.diagnosis import Diagnoser, make_diagnoser, run
 from fdi_gym.estimation.belief import fault_inputs
 from fdi_gym.estimation.labels import channel_sets
 from fdi_gym.faults import FaultScenario
-from fdi_gym.plant import Array, Plant, load_plant
+from fdi_gym.discovery import load_plant
+from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.huav_hover import (
     CHANNELS,
     DT,

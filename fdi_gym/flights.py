@@ -1,0 +1,204 @@
+"""Where N flights are, and the tables that they follow: what the compiled loop reads and moves on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fdi_gym import closed_loop
+from fdi_gym.closed_loop import FLYING, OVER, TERMINATED
+from fdi_gym.faults import Abrupt, FaultScenario, Hold, Incipient, Intermittent, Samples, Square
+from fdi_gym.model import contiguous
+from fdi_gym.plant import Inputs, Plant
+
+Array = np.ndarray
+
+NEVER = np.int64(2**62)  # a sample that does not come
+
+
+class Chunk(NamedTuple):
+    """Consecutive samples of N flights, in (sample, flight, signal) order. Rows after a flight's end mean nothing."""
+
+    obs: Array  # (m, N, n_obs)
+    state: Array  # (m, N, n_x)
+    theta: Array  # (m, N, n_theta)
+    label: Array  # (m, N) int64
+
+
+class _Made(NamedTuple):
+    """What a flight follows: tables, the true label's changes, injected noise."""
+
+    inputs: Inputs
+    labels: list[tuple[int, int]]
+    noise: tuple[Array | None, Array | None]
+
+
+class Flights:
+    """N flights under way: where each is, and the tables that it follows.
+
+    Args:
+        plant: The plant; its physical parameters come from each scenario.
+        scenarios: One per flight; they may differ in length.
+        noise: (w (K, n_x), v (K + 1, n_y)) per flight. Default: by counter, from each scenario's noise seed.
+        longest_lag: Samples that a sensor fault may lag behind.
+
+    Attributes:
+        k: (N,) the sample that each flight comes to next; the last one where it is over.
+        length: (N,) its last sample: as the scenario says, until it ends early.
+
+    Raises:
+        ValueError: A scenario that the plant refuses, or noise of another shape.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        scenarios: Sequence[FaultScenario],
+        noise: Sequence[tuple[Array, Array]] | None = None,
+        longest_lag: int = 0,
+    ):
+        n = len(scenarios)
+        n_x, n_y, n_u, n_theta = (len(a) for a in (plant.states, plant.outputs, plant.commands, plant.theta))
+        self.plant = plant
+        self._entries = {s.name: j for j, s in enumerate(plant.theta)}
+        self._commands = {s.name: j for j, s in enumerate(plant.commands)}
+        self.k, self.length = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        self.seed, self.status = np.zeros(n, np.uint64), np.full(n, OVER, np.int64)
+        self.x, self.c, self.u = np.zeros((n, n_x)), np.zeros((n, len(plant.c0))), np.zeros((n, n_u))
+        self.theta, self.p = np.zeros((n, n_theta)), np.zeros((n, len(plant.nominal_p)))
+        self.readings, self.history = np.zeros((n, n_y)), np.zeros((n, longest_lag + 1 if longest_lag else 0, n_y))
+        self.effects, self.held = np.zeros((n, 1, closed_loop.COLUMNS)), np.zeros((n, 1))
+        self.counts, self.labels = np.zeros(n, np.int64), np.full((n, 2, 2), NEVER)
+        self.tables: list[tuple[Any, ...]] = [()] * n  # reference, disturbance, w, v and samples of effects: by address
+        self.addresses = np.zeros((4, n), np.int64)
+        self.steps = np.ones((2, n), np.int64)  # from a sample's row of reference and disturbance to the next; 0: one row
+        self.values = np.zeros((n, 1), np.int64)
+        self.widths = np.zeros(2, np.int64)  # of reference and disturbance
+        self.begin(range(n), scenarios, noise)
+
+    def __len__(self) -> int:
+        return len(self.k)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name not in ("addresses", "values")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self.addresses = np.zeros((4, len(self)), np.int64)
+        self.values = np.zeros(self.effects.shape[:2], np.int64)
+        for i in range(len(self)):
+            self._point(i)
+
+    @property
+    def over(self) -> Array:
+        """(N,) bool: the last sample has been flown."""
+        return self.status >= OVER
+
+    @property
+    def terminated(self) -> Array:
+        """(N,) bool: ended before its scenario's last step."""
+        return self.status == TERMINATED
+
+    def begin(
+        self,
+        slots: Iterable[int],
+        scenarios: Sequence[FaultScenario],
+        noise: Sequence[tuple[Array, Array]] | None = None,
+    ) -> None:
+        """Put new flights in these slots; the others go on. What is refused leaves all as they are."""
+        plant, where = self.plant, np.array(list(slots))
+        made = [self._made(s, None if noise is None else noise[number]) for number, s in enumerate(scenarios)]
+        if len(where) != len(made):
+            raise ValueError(f"one scenario for each of the {len(where)} slots is needed, not {len(made)}")
+        self.widths[:] = made[0].inputs.reference.shape[1], made[0].inputs.disturbance.shape[1]
+        self.k[where], self.status[where], self.x[where], self.c[where] = 0, FLYING, plant.trim_state, plant.c0
+        self.u[where], self.theta[where] = plant.trim_command, plant.nominal_theta
+        self.length[where] = [scenario.steps for scenario in scenarios]
+        self.seed[where] = np.array([scenario.noise_seed for scenario in scenarios], np.uint64)
+        self.p[where] = [inputs.physical for inputs, *_ in made]
+        self.steps[:, where] = np.array([(len(i.reference) > 1, len(i.disturbance) > 1) for i, *_ in made]).T
+        for i, scenario, (inputs, labels, given) in zip(where.tolist(), scenarios, made, strict=True):
+            if scenario.x0 is not None:
+                self.x[i] = scenario.x0
+            samples = self._set_effects(i, scenario)
+            self._set_labels(i, labels)
+            self.tables[i] = (inputs.reference, inputs.disturbance, *given, samples)
+            self._point(i)
+
+    def _made(self, scenario: FaultScenario, noise: tuple[Array, Array] | None) -> _Made:
+        """What a scenario that the plant accepts makes."""
+        self.plant.validate(scenario)
+        given = (None, None) if noise is None else self._checked_noise(noise, scenario.steps)
+        return _Made(self.plant.inputs(scenario), self.plant.label_changes(scenario), given)
+
+    def _checked_noise(self, noise: tuple[Array, Array], steps: int) -> tuple[Array, Array]:
+        w, v = (contiguous(a) for a in noise)
+        wanted = (steps, len(self.plant.states)), (steps + 1, len(self.plant.outputs))
+        if (w.shape, v.shape) != wanted or not (np.isfinite(w).all() and np.isfinite(v).all()):
+            raise ValueError(f"noise is finite and has the shapes {wanted}, not {(w.shape, v.shape)}")
+        return w, v
+
+    def _set_effects(self, i: int, scenario: FaultScenario) -> dict[int, Array]:
+        """The rows of flight i's effects, in the order of listing; returns the tables of those that have one."""
+        plant, rows, samples = self.plant, [], {}
+        for fault in scenario.faults:
+            end = scenario.steps + 1 if fault.end is None else min(fault.end, scenario.steps + 1)
+            for effect in fault.effects:
+                match effect:
+                    case Abrupt(value=value):
+                        what = (closed_loop.ABRUPT, value, 0, 0)
+                    case Incipient(value=value, rate=rate):
+                        what = (closed_loop.INCIPIENT, value, rate, 0)
+                    case Intermittent(value=value, period=period, duty=duty):
+                        what = (closed_loop.INTERMITTENT, value, period, duty)
+                    case Square(value=value, other=other, period=period):
+                        what = (closed_loop.SQUARE, value, period, other)
+                    case Hold(command=command, lag=lag):
+                        what = (closed_loop.HOLD, 0, self._commands[command], lag)
+                    case Samples(values=values):
+                        what = (closed_loop.SAMPLES, 0, len(values), 0)
+                        samples[len(rows)] = np.array(values, float)
+                rows.append((self._entries[effect.entry], fault.onset, end, *what))
+        if len(rows) > self.effects.shape[1]:
+            more = len(rows) - self.effects.shape[1]
+            self.effects = np.pad(self.effects, ((0, 0), (0, more), (0, 0)))
+            self.held, self.values = (np.pad(a, ((0, 0), (0, more))) for a in (self.held, self.values))
+        self.counts[i] = len(rows)
+        if rows:
+            self.effects[i, : len(rows)] = rows
+            for e, row in enumerate(rows):
+                if row[3] == closed_loop.HOLD:  # the command before sample 0, until another is caught
+                    self.held[i, e] = plant.trim_command[row[5]]
+        return samples
+
+    def _set_labels(self, i: int, changes: Sequence[tuple[int, int]]) -> None:
+        if len(changes) >= self.labels.shape[1]:
+            more = len(changes) + 1 - self.labels.shape[1]
+            self.labels = np.pad(self.labels, ((0, 0), (0, more), (0, 0)), constant_values=NEVER)
+        self.labels[i, : len(changes)] = changes
+        self.labels[i, len(changes) :] = NEVER
+
+    def _point(self, i: int) -> None:
+        """Note where flight i's tables lie; they live as long as this does."""
+        *tables, samples = self.tables[i]
+        for column, table in enumerate(tables):
+            self.addresses[column, i] = 0 if table is None else table.__array_interface__["data"][0]
+        for e, table in samples.items():
+            self.values[i, e] = table.__array_interface__["data"][0]
+
+    def arrays(self) -> tuple[Array, ...]:
+        """Tables and state in the order of the compiled call."""
+        return (
+            self.seed, self.length, *self.addresses, *self.steps,
+            self.p, self.effects, self.counts, self.values, self.labels,
+            self.k, self.status, self.x, self.c, self.u, self.theta, self.held, self.readings, self.history,
+        )  # fmt: skip
+
+    def blank(self, samples: int) -> Chunk:
+        """An empty chunk of so many samples."""
+        plant, n = self.plant, len(self)
+        widths = len(plant.observed), len(plant.states), len(plant.theta)
+        obs, state, theta = (np.zeros((samples, n, width)) for width in widths)
+        return Chunk(obs, state, theta, np.zeros((samples, n), np.int64))

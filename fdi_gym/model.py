@@ -1,0 +1,134 @@
+"""A plant's compiled equations for many points at once: the model as filters use it, with its nominal parameters."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+Array = np.ndarray
+
+
+def contiguous(a: Any) -> Array:
+    """As the compiled kernels take an array: float64, in C order and writable; a copy only of one that is not."""
+    a = np.ascontiguousarray(a, float)
+    return a if a.flags.writeable else a.copy()
+
+
+class Model:
+    """What the equations of a plant's declaration say, without noise."""
+
+    dt: float
+    substeps: int
+    kernels: Any
+    states: tuple[Any, ...]
+    outputs: tuple[Any, ...]
+    commands: tuple[Any, ...]
+    theta: tuple[Any, ...]
+    disturbances: tuple[Any, ...]
+    physical: Callable[[Mapping[str, Any]], Array]
+
+    @functools.cached_property
+    def nominal_theta(self) -> Array:
+        """The healthy fault parameter (n_theta,)."""
+        return np.array([s.nominal for s in self.theta])
+
+    @functools.cached_property
+    def nominal_p(self) -> Array:
+        """The physical parameters of the model that diagnosers get."""
+        return contiguous(self.physical({}))
+
+    @functools.cached_property
+    def trim_command(self) -> Array:
+        """The command before the first sample (n_u,)."""
+        return np.array([s.nominal for s in self.commands])
+
+    @functools.cached_property
+    def trim_state(self) -> Array:
+        """The initial state where a scenario gives none (n_x,)."""
+        return np.array([s.nominal for s in self.states])
+
+    @functools.cached_property
+    def addresses(self) -> tuple[int, ...]:
+        """Addresses of the compiled kernels in the order of `Kernels`, with the defaults where the plant has none."""
+        from fdi_gym import kernels
+
+        given = zip(self.kernels._fields, self.kernels, strict=True)
+        return tuple(kernels.address(function or getattr(kernels, role)) for role, function in given)
+
+    def _rows(self, value: Array | None, default: Array) -> Array:
+        rows = default if value is None else np.asarray(value, float)
+        return contiguous(rows.reshape(math.prod(rows.shape[:-1]), rows.shape[-1]))  # also of zero width
+
+    def _rows_of(self, t: Any, x: Array, u: Array, theta: Any, d: Any, p: Any, width: int) -> tuple[Array, ...]:
+        """The arguments of a generic kernel from those of `propagate`, and an array for its output."""
+        points = contiguous(x.reshape(math.prod(x.shape[:-1]), x.shape[-1] if x.ndim else 1))
+        rows = (
+            points,
+            self._rows(u, self.trim_command),
+            self._rows(theta, self.nominal_theta),
+            self._rows(d, np.zeros(len(self.disturbances))),
+            self._rows(p, self.nominal_p),
+        )
+        times = contiguous(np.ravel(t))
+        for name, a, n in zip(("x", "u", "theta", "d", "p"), rows, self._widths, strict=True):
+            if a.shape[1] != n or (len(points) % len(a) if len(a) else len(points)):
+                raise ValueError(f"{name} has {n} columns and rows that serve the {len(points)} points alike, not {a.shape}")
+        if len(points) % times.size if times.size else len(points):
+            raise ValueError(f"t is one number, or serves the {len(points)} points alike, not {times.size} numbers")
+        return times, *rows, np.empty((len(points), width))
+
+    @functools.cached_property
+    def _widths(self) -> tuple[int, ...]:
+        """Of x, u, theta, d and p."""
+        vectors = (self.states, self.commands, self.theta, self.disturbances, self.nominal_p)
+        return tuple(len(vector) for vector in vectors)
+
+    def propagate(
+        self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None, p: Array | None = None
+    ) -> Array:
+        """The state one sample after x (..., n_x), without noise, u, theta and d held: the model's prediction.
+
+        u, theta, d and p may have fewer rows than x: row i of m then serves M/m consecutive points (sigma points of one
+        episode share their command). t [s] is a number or one per such group. theta, d and the physical parameters p
+        default to nominal, none and the model's.
+        """
+        from fdi_gym import integration
+
+        x = np.asarray(x, float)
+        rows = self._rows_of(t, x, u, theta, d, p, len(self.states))
+        integration.propagate(self.addresses[0], self.addresses[4], self.dt, self.substeps, *rows)
+        return rows[-1].reshape(x.shape)
+
+    def measure(
+        self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None, p: Array | None = None
+    ) -> Array:
+        """The noise-free sensor values at x (..., n_x); arguments as in `propagate`, u held up to t."""
+        from fdi_gym import integration
+
+        x = np.asarray(x, float)
+        rows = self._rows_of(t, x, u, theta, d, p, len(self.outputs))
+        integration.evaluate(self.addresses[1], *rows)
+        return rows[-1].reshape(*x.shape[:-1], len(self.outputs))
+
+    def derivative(self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None) -> Array:
+        """xdot at x (..., n_x); arguments as in `propagate`. For a discrete plant it is the next state."""
+        from fdi_gym import integration
+
+        x = np.asarray(x, float)
+        rows = self._rows_of(t, x, u, theta, d, None, len(self.states))
+        integration.evaluate(self.addresses[0], *rows)
+        return rows[-1].reshape(x.shape)
+
+    @functools.cached_property
+    def Q(self) -> Array:
+        """Covariance of the process noise per step (n_x, n_x)."""
+        return np.diag([s.sigma**2 for s in self.states])
+
+    @functools.cached_property
+    def R(self) -> Array:
+        """Covariance of the sensor noise (n_y, n_y)."""
+        return np.diag([s.sigma**2 for s in self.outputs])
