@@ -10,13 +10,12 @@ from pathlib import Path
 from tempfile import mkdtemp
 
 import torch
-from torch import nn
-from torch.nn import functional as F
-
 from baselines.networks import weights
 from baselines.networks.network import SequenceNetwork
 from baselines.networks.recipes import RECIPES
 from baselines.networks.supervised import Run
+from torch import nn
+from torch.nn import functional as F
 
 
 class Convolution(nn.Module):

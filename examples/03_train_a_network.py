@@ -8,6 +8,7 @@ from baselines.networks import weights
 from baselines.networks.flights import Source
 from baselines.networks.identification import Shape
 from baselines.networks.supervised import Recipe, Run
+
 from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.engine import simulate
 from fdi_gym.faults import draw

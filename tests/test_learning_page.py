@@ -1,9 +1,9 @@
 """The page of the learned diagnosers is that of their rows and cards, whichever rows there are."""
 
 import msgspec
+from baselines.networks import report, weights
 from conftest import ROOT
 
-from baselines.networks import report, weights
 from fdi_gym.evaluation import evaluate
 from fdi_gym.row import write_rows
 from fdi_gym.suite import load_suite

@@ -12,6 +12,7 @@ from typing import Any
 
 from baselines.networks import weights
 from baselines.networks.weights import Card
+
 from fdi_gym.files import write_whole
 from fdi_gym.leaderboard import clairvoyant, markdown, read_rows
 from fdi_gym.row import Row
