@@ -456,7 +456,7 @@ def test_sources_follow_imports_inside_functions_and_by_name():
     found = sources(["baselines.learned.sequence_net"])
     assert {"baselines.learned.weights", "baselines.learned._supervised", "fdi_gym.diagnosis", "fdi_gym.plant"} <= set(found)
     assert not any(name.split(".")[0] in ("numpy", "torch", "msgspec") for name in found)
-    assert "baselines.filters.two_stage_kf" in found  # it may hear any filter that it finds by name
+    assert "baselines.filters.two_stage_kf" in found  # it may be shown any filter that it finds by name
     other = sources(["baselines.filters.two_stage_kf"])
     assert any(name.startswith("fdi_gym.estimation.") for name in other)
     assert not {"baselines.filters.mekf", "fdi_gym.leaderboard", "fdi_gym.cli"} & set(other)

@@ -64,7 +64,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         labels, observed, estimated: Names, in order.
         task: "isolation", "identification" or "both".
         shape: What the network is made of.
-        filters: The diagnosers whose words it hears.
+        filters: The diagnosers that it is shown.
         seeds: First and last seed of the training, validation and calibration flights.
         budget: What was used: flights, samples, steps, seconds.
         curve: The training curve: one entry per validation.
