@@ -13,10 +13,11 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from baselines.networks import weights
-from baselines.networks.network import SequenceNetwork
-from baselines.networks.recipes import RECIPES
-from baselines.networks.supervised import Run
+from baselines.learned import weights
+from baselines.learned._network import SequenceNetwork
+from baselines.learned._supervised import SupervisedTraining
+from baselines.learned.recipes import sequence_recipe
+from fdi_gym.discovery import load_plant
 
 
 class Convolution(nn.Module):
@@ -55,7 +56,7 @@ class StateSpace(nn.Module):
         return y - x, h
 
 
-class Candidate(Run):
+class Candidate(SupervisedTraining):
     """A run with another memory in its network, or without the identified model."""
 
     memory: type[nn.Module] | None = None
@@ -69,10 +70,10 @@ class Candidate(Run):
             self.network = net
             self.optimiser = torch.optim.AdamW(net.parameters(), lr=self.recipe.rate, weight_decay=self.recipe.decay)
 
-    def flown(self, seeds):
-        found, records = super().flown(seeds)
+    def prepared(self, seeds):
+        found, records = super().prepared(seeds)
         if self.blind:
-            found.features[..., 2 * len(self.plant.observed) : len(self.progress.model.mean)] = 0
+            found.features[..., 2 * len(self.plant.observed) : len(self.model.mean)] = 0
         return found, records
 
 
@@ -88,9 +89,10 @@ if __name__ == "__main__":
     parser.add_argument("--plant", default="B747Lateral")
     parser.add_argument("--flights", type=int, default=512)
     arguments = parser.parse_args()
-    recipe = replace(RECIPES[arguments.plant], flights=arguments.flights)
+    plant = load_plant(arguments.plant)
+    recipe = replace(sequence_recipe(plant), flights=arguments.flights)
     for name, how in CANDIDATES.items():
-        run = type("Run", (Candidate,), how)("sequence_net", arguments.plant, recipe, seed=0, work=Path(mkdtemp()))
+        run = type("Training", (Candidate,), how)("sequence_net", plant, recipe, seed=0, work=Path(mkdtemp()))
         card = weights.read_card(run.run())
         size = sum(p.numel() for p in run.network.parameters())
         score = ", ".join(f"{k} {100 * v:.1f} %" for k, v in card.curve[-1]["accuracy"].items())

@@ -4,10 +4,11 @@ import argparse
 from pathlib import Path
 from tempfile import mkdtemp
 
-from baselines.networks import weights
-from baselines.networks.flights import Source
-from baselines.networks.identification import Shape
-from baselines.networks.supervised import Recipe, Run
+from baselines.learned import weights
+from baselines.learned._supervised import SupervisedTraining
+from baselines.learned.features import FeatureShape
+from baselines.learned.flights import Condition
+from baselines.learned.recipes import SequenceRecipe
 from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
@@ -17,19 +18,19 @@ from fdi_gym.faults import draw
 parser = argparse.ArgumentParser()
 parser.add_argument("--flights", type=int, default=64)
 flights = parser.parse_args().flights
-recipe = Recipe(
-    sources=(Source("standard", {}),), shape=Shape(stride=10, lags=5, degree=1),
+recipe = SequenceRecipe(
+    conditions=(Condition("standard", {}),), shape=FeatureShape(stride=10, lags=5, degree=1),
     flights=flights, identify=50, chunk=min(64, flights), passes=4, validate=4, validation=20, hidden=32,
 )  # fmt: skip
 
 if __name__ == "__main__":
-    path = Run("sequence_net", "B747Lateral", recipe, seed=0, work=Path(mkdtemp())).run()
+    plant = load_plant("B747Lateral")
+    path = SupervisedTraining("sequence_net", plant, recipe, seed=0, work=Path(mkdtemp())).run()
     card = weights.read_card(path)
     for entry in card.curve:
         print(f"step {entry['step']:4d}, {entry['seconds']:5.1f} s: balanced accuracy {entry['accuracy']['standard']:.3f}")
     before, after = card.calibration["standard"].log_score
     print(f"log score on validation flights: {before:.3f}, calibrated {after:.3f}")
-    plant = load_plant("B747Lateral")
     seen = simulate(plant, [draw(plant.process("standard"), seed) for seed in range(20)])
     said = run(make_diagnoser("sequence_net", plant, path=str(path)), seen.obs)
     print("right labels:", (said.label == seen.label)[:, 1:].mean().round(3))

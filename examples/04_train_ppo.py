@@ -7,7 +7,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
-from baselines.networks.adapters import from_sb3
+from baselines.learned.adapters import from_sb3
 from fdi_gym.diagnosis import run
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate

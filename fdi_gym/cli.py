@@ -205,14 +205,15 @@ def train(
         budget: How much to train: flights per process, or for reinforcement learning agent steps. Default: the recipe's.
         seed: Of the run.
         work: Folder of runs: checkpoint, tensorboard log, weights and card.
-        threads: Of torch.
+        threads: Of the library that trains.
         output: Folder that gets a copy of weights and card.
     """
+    from fdi_gym.diagnosis import train as run
     from fdi_gym.files import write_whole
     from fdi_gym.listing import find_plant
-    from fdi_gym.training import train as run
+    from fdi_gym.discovery import load_plant
 
-    path = run(method, find_plant(plant)[1], budget=budget, seed=seed, work=work, threads=threads)
+    path = run(method, load_plant(find_plant(plant)[1]), budget=budget, seed=seed, work=work, threads=threads)
     for suffix in (".safetensors", ".json"):
         if output is not None:
             output.mkdir(parents=True, exist_ok=True)

@@ -6,13 +6,21 @@ import difflib
 import inspect
 from collections.abc import Callable, Iterator
 
-from fdi_gym.diagnosis import Entry, NotApplicableError, broken_plugins, diagnosers, find_diagnoser, make_diagnoser
+from fdi_gym.diagnosis import (
+    Entry,
+    NotApplicableError,
+    broken_plugins,
+    diagnosers,
+    find_diagnoser,
+    find_trainer,
+    make_diagnoser,
+    trainers,
+)  # fmt: skip
 from fdi_gym.diagnosis.registry import GIVEN
 from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.faults import draw
 from fdi_gym.names import blamed, find_module, unknown
 from fdi_gym.suite import Suite, load_suite, suite_names
-from fdi_gym.training import trainers
 
 
 def find_plant(text: str) -> tuple[str, str]:
@@ -69,7 +77,7 @@ def details(text: str) -> str:
     if text in diagnosers():
         found.append(_diagnoser(find_diagnoser(text)))
     if text in trainers():
-        found.append(f"{text}: {trainers()[text].summary}\n\n  fdi-gym train {text} PLANT")
+        found.append(_trainer(find_trainer(text)))
     if not found:
         everything = [*sorted(ids), *suite_names(), *diagnosers(), *trainers()]
         near = " or ".join(difflib.get_close_matches(text, everything, 3))
@@ -78,10 +86,12 @@ def details(text: str) -> str:
 
 
 def _outside(text: str, name: str) -> str:
-    """What "module:name" names: a plant that the module registers, or else a builder in it."""
-    find_module(text.rpartition(":")[0])
+    """What "module:name" names: a plant that the module registers, or else a trainer or a builder in it."""
+    function = getattr(find_module(text.rpartition(":")[0]), name, None)
     if name in plant_sources() or name in {f"{p}-Faults-v{s.version}" for p, s in plant_sources().items()}:
         return load_plant(find_plant(text)[1]).describe()
+    if any(entry.build is function for entry in trainers().values()):
+        return _trainer(find_trainer(text))
     return _diagnoser(find_diagnoser(text))
 
 
@@ -94,18 +104,25 @@ def _suite(suite: Suite) -> str:
 
 
 def _diagnoser(entry: Entry) -> str:
-    lines = [f"{entry.name}: {entry.summary}"]
-    lines += ["", "settings"]
+    return "\n".join([*_settings(entry), "", "plants, as they are by default", *_plants(entry)])
+
+
+def _trainer(entry: Entry) -> str:
+    return "\n".join([*_settings(entry), "", f"  fdi-gym train {entry.name} PLANT"])
+
+
+def _settings(entry: Entry) -> Iterator[str]:
+    yield from (f"{entry.name}: {entry.summary}", "", "settings")
     for parameter in list(inspect.signature(entry.build).parameters.values())[1:]:
-        if parameter.name in GIVEN:
-            lines.append(f"  {parameter.name:20s} {GIVEN[parameter.name]}")
+        if parameter.name in GIVEN[entry.kind]:
+            said = GIVEN[entry.kind][parameter.name]
         elif parameter.name in entry.settings:
-            lines.append(f"  {parameter.name:20s} {entry.settings[parameter.name]!r} under this name")
+            said = f"{entry.settings[parameter.name]!r} under this name"
         elif parameter.default is not inspect.Parameter.empty:
-            lines.append(f"  {parameter.name:20s} {parameter.default!r}")
+            said = repr(parameter.default)
         else:
-            lines.append(f"  {parameter.name:20s} no default")
-    return "\n".join([*lines, "", "plants, as they are by default", *_plants(entry)])
+            said = "no default"
+        yield f"  {parameter.name:20s} {said}"
 
 
 def _plants(entry: Entry) -> Iterator[str]:
@@ -113,8 +130,8 @@ def _plants(entry: Entry) -> Iterator[str]:
         plant = load_plant(plant_id)
         try:
             with blamed(entry.name):
-                make_diagnoser(entry.name, plant, scenarios=[draw(plant.process("standard"), 0)])
-            yield f"  {plant_id:20s} runs"
+                built = make_diagnoser(entry.name, plant, scenarios=[draw(plant.process("standard"), 0)])
+            yield f"  {plant_id:20s} runs{'' if built.gaps else '; its diagnosis is held while a sensor is missing'}"
         except NotApplicableError as error:
             yield f"  {plant_id:20s} does not run: {error}"
         except ValueError as error:

@@ -99,7 +99,9 @@ class _Boxed(Task):
 
     def _bounded(self, low: Array, high: Array) -> None:
         self.low, self.high = np.asarray(low, float), np.asarray(high, float)
-        self.space = Box(-1.0, 1.0, self.low.shape, np.float32) if self.scaled else Box(self.low, self.high, dtype=np.float64)
+        self.space = (
+            Box(-1.0, 1.0, self.low.shape, np.float32) if self.scaled else Box(self.low, self.high, dtype=np.float64)
+        )
 
     def _physical(self, action: Any, shape: tuple[int, ...]) -> Array:
         """Checked, in physical units; what is finite and outside the bounds is clipped."""
@@ -201,7 +203,9 @@ class Scenario(_Boxed):
         value = declaration.astype(float)
         value[..., ONSET : END + 1] /= np.asarray(length)[..., None, None]
         value = value.reshape(*value.shape[:-2], -1)
-        value[..., SIZE::COLUMNS] = np.where(value[..., PRESENT::COLUMNS] >= 0.5, value[..., SIZE::COLUMNS], self.low[SIZE::COLUMNS])
+        value[..., SIZE::COLUMNS] = np.where(
+            value[..., PRESENT::COLUMNS] >= 0.5, value[..., SIZE::COLUMNS], self.low[SIZE::COLUMNS]
+        )
         if self.scaled:
             span = np.where(self.high > self.low, self.high - self.low, 1.0)
             value = (2 * (value - self.low) / span - 1).astype(np.float32)

@@ -13,9 +13,8 @@ import pytest
 from conftest import PLANTS, ROOT
 
 from fdi_gym import __version__, cli, suite
-from fdi_gym.diagnosis import broken_plugins, diagnosers, registry
+from fdi_gym.diagnosis import broken_plugins, diagnosers, registry, trainers
 from fdi_gym.suite import Suite, freeze, load_suite, suite_names
-from fdi_gym.training import trainers
 
 FDI_GYM = [sys.executable, "-m", "fdi_gym.cli"]
 

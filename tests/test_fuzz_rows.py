@@ -212,8 +212,7 @@ def test_block_files(home, tmp_path, size, counted):
 @both
 @pytest.mark.parametrize("method", ["ppo", "sequence_net"])
 def test_weights_and_cards(tmp_path, size, counted, method):
-    weights = pytest.importorskip("baselines.networks.weights")
-    pytest.importorskip("torch")
+    weights = pytest.importorskip("baselines.learned.weights")
     plant = build("B747Lateral")
     source = weights.WEIGHTS / f"{method}-B747Lateral.safetensors"
     tensors, card = source.read_bytes(), source.with_suffix(".json").read_bytes()

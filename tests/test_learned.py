@@ -5,36 +5,50 @@ import hashlib
 import itertools
 import json
 import pickle
+import re
 import sys
 import zipfile
 
+import joblib
 import numpy as np
 import pytest
 import torch
-from conftest import build
+from conftest import PLANTS, build
 from safetensors.numpy import load_file, save_file
 
-from baselines.networks import calibration, flights, identification, recipes, weights
-from baselines.networks.flights import CALIBRATION, TEST, TRAINING, VALIDATION, Source
-from baselines.networks.identification import Shape
-from baselines.networks.network import SequenceNetwork, loss
-from baselines.networks.supervised import Recipe, Run
-from fdi_gym.diagnosis import NotApplicableError, make_diagnoser, run
+from baselines.learned import features, flights, probabilities, recipes, sequence_net, weights
+from baselines.learned._network import SequenceNetwork, loss
+from baselines.learned._supervised import SupervisedTraining
+from baselines.learned.features import FeatureShape
+from baselines.learned.flights import CALIBRATION, TEST, TRAINING, VALIDATION, Condition
+from baselines.learned.recipes import SequenceRecipe
+from fdi_gym.diagnosis import (
+    NotApplicableError,
+    find_diagnoser,
+    find_trainer,
+    make_diagnoser,
+    registry,
+    run,
+    train,
+    trainer,
+    trainers,
+)
+from fdi_gym.listing import details
 from fdi_gym.discovery import load_plant
 from fdi_gym.suite import load_suite, suite_names
 from fdi_gym.testing import check_diagnoser
-from fdi_gym.training import find_trainer, trainers
 
-TINY = Recipe(
-    sources=(Source("standard", {}), Source("hard", {})), shape=Shape(20, 3, 1), flights=16, identify=8, chunk=8, passes=2,
-    validation=4, validate=1, batch=8, hidden=16,
+TINY = SequenceRecipe(
+    conditions=(Condition("standard", {}), Condition("hard", {})), shape=FeatureShape(20, 3, 1),
+    flights=16, identify=8, chunk=8, passes=2, validation=4, validate=1, batch=8, hidden=16,
 )  # fmt: skip
 COMMITTED = sorted(weights.WEIGHTS.glob("*.safetensors"))
+LEARNED = ("sequence_net", "residual_net", "ppo", "ppo_identification")
 NETWORKS = [path for path in COMMITTED if "_net-" in path.stem]
 
 
 def trained(folder, recipe=TINY, plant="B747Lateral", **arguments):
-    return Run("sequence_net", plant, recipe, seed=1, work=folder).run(**arguments)
+    return SupervisedTraining("sequence_net", build(plant), recipe, seed=1, work=folder).run(**arguments)
 
 
 @pytest.fixture(scope="module")
@@ -46,31 +60,31 @@ def tiny(tmp_path_factory):
 # The network sees a stream as it saw whole flights
 
 
-@pytest.mark.parametrize("shape", [Shape(4, 3, 1), Shape(5, 2, 2, 2, 3)], ids=["linear", "products"])
+@pytest.mark.parametrize("shape", [FeatureShape(4, 3, 1), FeatureShape(5, 2, 2, 2, 3)], ids=["linear", "products"])
 @pytest.mark.parametrize("plant_id", ["B747Lateral", "MissilePitch"])
 def test_features_of_a_stream_are_those_of_the_whole_flight(plant_id, shape):
     plant = build(plant_id)
-    record = flights.fly(plant, Source("standard", {}), range(TRAINING, TRAINING + 4))
-    z = identification.blocks(plant, record.obs, shape.stride)
-    delta = flights.at_steps(identification.deviation(plant, record.target), shape.stride)[:, : z.shape[1]]
-    model = identification.identify(plant, shape, [(z, delta)])
-    model = identification.standardised(plant, shape, model, z)
-    assert {f"model.{k}": a.shape for k, a in model._asdict().items()} == identification.shapes(plant, shape)
-    whole = identification.features(plant, shape, model, z)
-    stream, seen = identification.begin(plant, shape, 4), []
+    record = flights.fly(plant, Condition("standard", {}), range(TRAINING, TRAINING + 4))
+    z = features.blocks(plant, record.obs, shape.stride)
+    delta = flights.at_steps(features.deviation(plant, record.target), shape.stride)[:, : z.shape[1]]
+    model = features.identify(plant, shape, [(z, delta)])
+    model = features.standardised(plant, shape, model, z)
+    assert {f"model.{k}": a.shape for k, a in model._asdict().items()} == features.tensor_shapes(plant, shape)
+    whole = features.features(plant, shape, model, z)
+    stream, seen = features.begin(plant, shape, 4), []
     for k in range(record.obs.shape[1]):
-        stream, features = identification.add(plant, shape, model, stream, record.obs[:, k], k)
-        seen += [] if features is None else [features]
+        stream, found = features.add(plant, shape, model, stream, record.obs[:, k], k)
+        seen += [] if found is None else [found]
     assert np.allclose(np.stack(seen, axis=1), whole, atol=1e-5)
 
 
 def test_identified_residuals_are_white_where_the_plant_is_linear_and_healthy():
-    plant, shape = build("B747Lateral"), Shape(1, 20, 1)
-    record = flights.fly(plant, Source("fault-free", {}), range(TRAINING, TRAINING + 40))
-    z = identification.blocks(plant, record.obs, 1)
-    model = identification.identify(plant, shape, [(z, np.zeros((*z.shape[:2], 4)))])
-    phi, psi = identification._sequences(plant, shape, z)
-    e, _, _ = identification.information(model, phi, psi, z[:, 20:, 0, :4])
+    plant, shape = build("B747Lateral"), FeatureShape(1, 20, 1)
+    record = flights.fly(plant, Condition("fault-free", {}), range(TRAINING, TRAINING + 40))
+    z = features.blocks(plant, record.obs, 1)
+    model = features.identify(plant, shape, [(z, np.zeros((*z.shape[:2], 4)))])
+    phi, psi = features._sequences(plant, shape, z)
+    e, _, _ = features.information(model, phi, psi, z[:, 20:, 0, :4])
     assert np.allclose(np.cov(e.reshape(-1, 4).T), np.eye(4), atol=0.05)
     assert abs(np.mean(e[:, 1:] * e[:, :-1])) < 0.02
 
@@ -78,18 +92,17 @@ def test_identified_residuals_are_white_where_the_plant_is_linear_and_healthy():
 @pytest.mark.parametrize("path", NETWORKS, ids=lambda p: p.stem)
 def test_streamed_diagnoses_are_those_of_the_whole_sequence(path):
     card = weights.read_card(path)
-    source = Source(card.processes[0], card.options[0])
+    condition = Condition(card.processes[0], card.options[0])
     plant = load_plant(card.plant, **card.options[0])
     tensors, card = weights.read(path, plant)
-    shape = Shape(**{name: card.shape[name] for name in Shape._fields if name in card.shape})
-    model = identification.Model(*(tensors[f"model.{name}"] for name in identification.Model._fields))
-    record = flights.fly(plant, source, range(VALIDATION, VALIDATION + 3))
-    obs = record.obs[:, : 30 * shape.period + 3]
-    seen = [identification.features(plant, shape, model, identification.blocks(plant, obs, shape.stride))]
-    seen.append(flights.context(np.zeros(3, int), len(card.processes), 30))
-    heard = flights.words(card.plant, source, card.filters, obs, shape.period)
-    x = torch.from_numpy(np.concatenate([*seen, *heard], axis=2)).double()
-    widths = tuple(word.shape[2] for word in heard)
+    shape, model = weights.shape_of(path, card)[0], weights.model_of(tensors)
+    record = flights.fly(plant, condition, range(VALIDATION, VALIDATION + 3))
+    obs = record.obs[:, : 20 * shape.period + 3]
+    seen = [features.features(plant, shape, model, features.blocks(plant, obs, shape.stride))]
+    seen.append(flights.context(np.zeros(3, int), len(card.processes), 20))
+    told = flights.filters_features(plant, condition, card.filters, obs, shape.period)
+    x = torch.from_numpy(np.concatenate([*seen, *told], axis=2)).double()
+    widths = tuple(part.shape[2] for part in told)
     size = (x.shape[2], len(plant.labels), len(plant.estimated), card.shape["hidden"], widths, len(card.processes))
     net = SequenceNetwork(*size).double()
     net.load_state_dict({name: torch.from_numpy(tensors[f"network.{name}"]) for name in net.state_dict()})
@@ -97,11 +110,11 @@ def test_streamed_diagnoses_are_those_of_the_whole_sequence(path):
         logits, mean, log_std, _ = (a.numpy() for a in net(x))
     said = run(make_diagnoser(path.stem.split("-")[0], plant), obs)
     fitted = card.calibration[card.processes[0]]
-    probs = np.exp(calibration.log_softmax(fitted.scale * logits + np.array(fitted.bias)))
+    probs = np.exp(probabilities.log_softmax(fitted.scale * logits + np.array(fitted.bias)))
     at = slice(shape.period - 1, None, shape.period)
     unit = np.array([s.scale for s in plant.estimated])
     assert np.allclose(said.label_probs[:, at], probs, atol=1e-5)
-    assert np.allclose(identification.deviation(plant, said.estimate[:, at]), mean, atol=1e-5)
+    assert np.allclose(features.deviation(plant, said.estimate[:, at]), mean, atol=1e-5)
     assert np.allclose(said.estimate_std[:, at] / unit, np.exp(log_std), rtol=1e-5)
     assert np.array_equal(said.label[:, at], logits.argmax(axis=2))
 
@@ -127,9 +140,9 @@ def test_loss_falls_on_a_fixed_batch():
     assert values[-1] < 0.4 * values[0]
 
 
-def test_an_untrained_network_believes_the_filters_it_hears():
+def test_an_untrained_network_believes_the_filters_it_is_shown():
     torch.manual_seed(0)
-    net = SequenceNetwork(8 + 2 + 4 + 6, 3, 2, 16, words=(4, 6), processes=2)
+    net = SequenceNetwork(8 + 2 + 4 + 6, 3, 2, 16, filters=(4, 6), processes=2)
     x = torch.zeros(2, 5, 20)
     x[0, :, 8] = x[1, :, 9] = 1.0  # the first expects one process, the second the other
     plain = net(x)[0]
@@ -144,26 +157,62 @@ def test_an_untrained_network_believes_the_filters_it_hears():
     assert torch.allclose(gain[1], torch.tensor([0.0, 0.0, 1.5]), atol=1e-5)
 
 
-def test_a_network_that_hears_starts_from_one_that_does_not_on_any_plant(tmp_path):
+@pytest.mark.parametrize(("plant_id", "filter"), [("DCMotor", "multiple_model_ekf"), ("B747Lateral", "two_stage_kf")])
+def test_a_network_that_is_shown_filters_starts_from_one_that_is_not(plant_id, filter, tmp_path):
+    plant = build(plant_id)
     recipe = dataclasses.replace(
-        recipes.general("DCMotor"), flights=8, identify=8, chunk=8, passes=1, validation=4, hidden=8
+        recipes.sequence_recipe(plant),
+        shape=FeatureShape(20, 3, 1),
+        flights=4,
+        identify=8,
+        chunk=4,
+        passes=1,
+        validation=2,
+        hidden=8,
     )
-    hears = dataclasses.replace(recipe, filters=("augmented_ekf_cusum", "null"))
-    with pytest.raises(ValueError, match="train sequence_net DCMotor"):
-        Run("residual_net", "DCMotor", hears, seed=0, work=tmp_path / "none", base=tmp_path / "none.safetensors")
-    base = Run("sequence_net", "DCMotor", recipe, seed=0, work=tmp_path / "base").run()
-    run_ = Run("residual_net", "DCMotor", hears, seed=0, work=tmp_path / "run", base=base)
-    old, new = load_file(base), run_.network.state_dict()
+    shown = dataclasses.replace(recipe, filters=(filter, "null"))
+    with pytest.raises(ValueError, match=f"train sequence_net {plant_id}"):
+        SupervisedTraining("residual_net", plant, shown, seed=0, work=tmp_path / "none", base=tmp_path / "none.safetensors")
+    base = SupervisedTraining("sequence_net", plant, recipe, seed=0, work=tmp_path / "base").run()
+    training = SupervisedTraining("residual_net", plant, shown, seed=0, work=tmp_path / "run", base=base)
+    old, new = load_file(base), training.network.state_dict()
     assert np.array_equal(new["memory.weight_hh_l0"], old["network.memory.weight_hh_l0"])
     assert not new["value.weight"][:, old["network.value.weight"].shape[1] :].any()
-    path = run_.run()
-    assert weights.read_card(path).filters == ["augmented_ekf_cusum", "null"]
-    check_diagnoser(lambda p, _: make_diagnoser("residual_net", p, path=str(path)), build("DCMotor"), samples=60)
+    path = training.run()
+    assert weights.read_card(path).filters == [filter, "null"]
+    check_diagnoser(lambda p, _: make_diagnoser("residual_net", p, path=str(path)), plant, samples=60)
+
+
+@pytest.mark.parametrize("filters", [(), (4, 6)], ids=["alone", "filters"])
+def test_a_step_on_numpy_is_a_step_of_the_network_that_was_trained(filters):
+    torch.manual_seed(0)
+    net = SequenceNetwork(8 + 2 + sum(filters), 3, 2, 16, filters, processes=2).double()
+    for value in net.parameters():
+        value.data.normal_(std=0.7)
+    tensors = {name: value.numpy() for name, value in net.state_dict().items()}
+    x = np.random.default_rng(0).normal(size=(5, 7, net.value.in_features))
+    with torch.inference_mode():
+        whole = [a.numpy() for a in net(torch.from_numpy(x))[:3]]
+    h = np.zeros((5, 16))
+    for k in range(x.shape[1]):
+        *answer, h = sequence_net.forward(tensors, x[:, k], h, 3, 2)
+        for a, b in zip(answer, whole, strict=True):
+            assert np.allclose(a, b[:, k], atol=1e-12)
+
+
+@pytest.mark.parametrize("plant_id", ["DCMotor", "B747Lateral"])  # of outside, and of the package
+def test_what_filters_say_is_the_same_in_another_process(plant_id):
+    plant, condition = build(plant_id), Condition("standard", {})
+    arguments = (plant, condition, ("null", "random"), flights.fly(plant, condition, range(3)).obs[:, :40], 4)
+    here = flights.filters_features(*arguments)
+    for there in joblib.Parallel(2)(joblib.delayed(flights.filters_features)(*arguments) for _ in range(2)):
+        assert [a.shape[:2] for a in there] == [(3, 10), (3, 10)]
+        assert all(np.array_equal(a, b) for a, b in zip(here, there, strict=True))
 
 
 def test_a_network_is_told_the_process_and_takes_an_unknown_one_for_the_first(tiny):
     plant = build("B747Lateral")
-    obs = flights.fly(plant, Source("standard", {}), range(VALIDATION, VALIDATION + 2)).obs[:, :200]
+    obs = flights.fly(plant, Condition("standard", {}), range(VALIDATION, VALIDATION + 2)).obs[:, :200]
     first, same, other = (
         run(make_diagnoser("sequence_net", plant, path=str(tiny), process=name), obs)
         for name in ("standard", "gust", "hard")
@@ -193,30 +242,80 @@ def test_a_run_leaves_a_card_and_a_log(tiny):
     card = weights.read_card(tiny)
     assert card.env == "B747Lateral-Faults-v0"
     assert card.budget["steps"] == 8
-    assert [entry["step"] for entry in card.curve] == [2, 4, 6, 8]
+    assert [(entry["step"], entry["flights"]) for entry in card.curve] == [(2, 8), (4, 8), (6, 16), (8, 16)]
     assert card.seeds["training"] == [TRAINING + 1_000_000, TRAINING + 1_000_023]
     assert list((tiny.parent / "tensorboard").iterdir())
     assert set(card.calibration) == {"standard", "hard"}
 
 
-def test_trainers_are_found_by_name():
-    assert {"sequence_net", "residual_net"} <= set(trainers())
-    with pytest.raises(ValueError, match="unknown trainer"):
-        find_trainer("no_such")
+# ---------------------------------------------------------------------------------------------------------------
+# Trainers by name, in the registry of the diagnosers
+
+
+def test_every_learned_method_has_a_trainer_of_its_name():
+    assert set(LEARNED) == set(trainers())
+    with pytest.raises(ValueError, match=r"unknown trainer 'sequence_nett'; did you mean sequence_net\?"):
+        find_trainer("sequence_nett")
+    with pytest.raises(ValueError, match="two trainers are called 'ppo'"):
+        trainer("ppo", "Another")(lambda plant: None)
+
+
+def outside(plant, *, work, seed, scale=1.0):
+    """A trainer of one's own, which takes no budget."""
+    path = work / "own.safetensors"
+    save_file({"a": np.full(1, scale * seed)}, path)
+    return path
+
+
+def test_a_trainer_gets_what_it_takes(tmp_path, b747):
+    name = f"{__name__}:outside"
+    assert load_file(train(name, b747, seed=3, work=tmp_path, scale=2.0))["a"] == 6.0
+    for arguments, reason in [
+        ({"budget": 5}, "takes no budget"), ({"rate": 1.0}, "has no setting 'rate'; it has scale"),
+        ({"seed": -1}, "seed is 0 or more"), ({"work": tmp_path / "none"}, "No such file"),
+    ]:  # fmt: skip
+        with pytest.raises(ValueError, match=reason):
+            train(name, b747, **{"work": tmp_path, **arguments})
+
+
+def test_list_says_what_a_trainer_takes(monkeypatch):
+    assert "fdi-gym train ppo_identification PLANT" in details("ppo_identification")
+    assert "'identification' under this name" in details("ppo_identification")
+    entry = registry.Entry("trainer", "outside", "One's own", outside, {})
+    monkeypatch.setitem(registry._entries["trainer"], "outside", entry)
+    assert f"fdi-gym train {__name__}:outside PLANT" in details(f"{__name__}:outside")
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_learned_methods_are_held_through_gaps_and_their_entry_says_so(name, b747):
+    """Nothing that is missing reaches a network: what it said stands, and its answer afterwards is a number."""
+    diagnoser = make_diagnoser(name, b747)
+    assert not diagnoser.gaps
+    assert re.search(r"B747Lateral +runs; its diagnosis is held while a sensor is missing", details(name))
+    obs = flights.fly(b747, Condition("hard", {}), range(VALIDATION, VALIDATION + 2)).obs[:, :160].copy()
+    whole = run(diagnoser, obs)
+    obs[0, 60:75, 2] = np.nan
+    said = run(diagnoser, obs)
+    for field in ("label", "estimate", "label_probs"):
+        value, plain = getattr(said, field), getattr(whole, field)
+        if value is not None:
+            assert (value[0, 60:75] == value[0, 59]).all(), field
+            assert np.array_equal(value[1], plain[1]), field
+            assert np.isfinite(value).all(), field
 
 
 def test_calibration_recovers_a_temperature_and_improves_the_log_score():
     rng = np.random.default_rng(0)
     logits = rng.standard_normal((20000, 3)) * 2
     bias = np.array([1.0, 0.0, -1.0])
-    true = np.exp(calibration.log_softmax(0.5 * logits + bias))
+    true = np.exp(probabilities.log_softmax(0.5 * logits + bias))
     label = (true.cumsum(axis=1) < rng.random((len(true), 1))).sum(axis=1)
-    scale, fitted = calibration.fit(logits, label, np.full(3, 1 / 3))
+    scale, fitted = probabilities.fit(logits, label, np.full(3, 1 / 3))
     assert scale == pytest.approx(0.5, abs=0.03)
     assert fitted - fitted.mean() == pytest.approx(bias, abs=0.06)
-    before, after = calibration.log_softmax(logits), calibration.log_softmax(scale * logits + fitted)
-    assert calibration.log_score(after, label) > calibration.log_score(before, label)
-    assert calibration.calibration_error(after, label) < 0.02 < calibration.calibration_error(before, label)
+    before, after = probabilities.log_softmax(logits), probabilities.log_softmax(scale * logits + fitted)
+    assert probabilities.log_score(after, label) > probabilities.log_score(before, label)
+    assert probabilities.calibration_error(after, label) < 0.02 < probabilities.calibration_error(before, label)
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -237,8 +336,8 @@ def test_every_recipe_trains_on_training_seeds(tiny, monkeypatch):
     drawn = []
     draw = flights.draw
     monkeypatch.setattr(flights, "draw", lambda process, seed: drawn.append(seed) or draw(process, seed))
-    run = Run("sequence_net", "B747Lateral", TINY, seed=1, work=tiny.parent)
-    run.chunk(0), run.chunk(1)
+    training = SupervisedTraining("sequence_net", build("B747Lateral"), TINY, seed=1, work=tiny.parent)
+    training.chunk(0), training.chunk(1)
     first, last = weights.read_card(tiny).seeds["training"]
     assert drawn
     assert all(first <= seed <= last for seed in drawn)
@@ -325,17 +424,26 @@ def test_a_card_that_does_not_fit_is_refused(tiny, tmp_path):
         make_diagnoser("sequence_net", load_plant("B747Lateral", labels="dual"), path=str(altered(tiny, tmp_path)))
 
 
-def test_without_weights_or_torch_the_reason_is_given(monkeypatch):
+def test_without_weights_or_a_library_the_reason_is_given(monkeypatch, tmp_path):
     with pytest.raises(NotApplicableError, match="fdi-gym train sequence_net DCMotor"):
         make_diagnoser("sequence_net", build("DCMotor"))
-    for name in [m for m in sys.modules if m.startswith("baselines.networks")]:
+    for name in [m for m in sys.modules if m.startswith("baselines.learned._")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(NotApplicableError, match=r"fdi-gym\[learn\]"):
-        make_diagnoser("sequence_net", build("B747Lateral"))
+    make_diagnoser("sequence_net", build("B747Lateral"))
+    for name in trainers():
+        with pytest.raises(NotApplicableError, match=r"needs torch: pip install 'fdi-gym\[learn\]'"):
+            train(name, build("B747Lateral"), work=tmp_path)
+    monkeypatch.setitem(sys.modules, "safetensors", None)
+    for name in LEARNED:
+        with pytest.raises(NotApplicableError, match=r"needs safetensors: pip install 'fdi-gym\[learn\]'"):
+            make_diagnoser(name, build("B747Lateral"))
 
 
-def test_recipes_name_what_exists():
-    for plant_id, recipe in recipes.RECIPES.items():
-        for source in recipe.sources:
-            assert source.process in flights.plant_of(plant_id, source).processes
+@pytest.mark.parametrize("plant_id", PLANTS)
+def test_recipes_name_what_exists(plant_id):
+    plant = build(plant_id)
+    for condition in recipes.sequence_recipe(plant).conditions:
+        assert condition.process in flights.plant_under(plant, condition).processes
+    for name in recipes.residual_recipe(plant).filters:
+        assert not find_diagnoser(name).clairvoyant

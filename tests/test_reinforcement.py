@@ -10,29 +10,33 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
-from baselines.networks import identification, weights
-from baselines.networks.adapters import from_sb3, from_torch
-from baselines.networks.flights import VALIDATION, Source, fly, identified
-from baselines.networks.identification import Shape
-from baselines.networks.observed import IdentifiedFeatures
-from baselines.networks.reinforcement import Recipe, Run
+from baselines.learned import features, weights
+from baselines.learned._reinforcement import PolicyTraining
+from baselines.learned.adapters import from_sb3, from_torch
+from baselines.learned.feature_env import IdentifiedFeatures
+from baselines.learned.features import FeatureShape
+from baselines.learned.flights import VALIDATION, Condition, fly, identified
+from baselines.learned.recipes import PolicyRecipe
 from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.engine import simulate
 from fdi_gym.sb3 import FDIVecEnv, make_vec_env
 from fdi_gym.testing import check_diagnoser
 from fdi_gym.wrappers import VectorHistory
 
-SOURCES = (Source("standard", {}), Source("hard", {}))
-SHAPE = Shape(stride=50, lags=2, degree=1, every=2)
-TINY = Recipe(
-    sources=SOURCES, shape=SHAPE, identify=10, decisions=192, envs=8, steps=4, updates=2, epochs=1, batch=16, hidden=8,
+CONDITIONS = (Condition("standard", {}), Condition("hard", {}))
+SHAPE = FeatureShape(stride=50, lags=2, degree=1, every=2)
+TINY = PolicyRecipe(
+    conditions=CONDITIONS, shape=SHAPE, identify=10, decisions=192, envs=8, steps=4, updates=2, epochs=1, batch=16, hidden=8,
     validate=1, validation=4,
 )  # fmt: skip
-FAST = {"B747Lateral": Shape(stride=4, lags=3, degree=1, every=2), "HUAVHover": Shape(stride=7, lags=2, degree=1)}
+FAST = {
+    "B747Lateral": FeatureShape(stride=4, lags=3, degree=1, every=2),
+    "HUAVHover": FeatureShape(stride=7, lags=2, degree=1),
+}
 
 
 def trained(folder, method="ppo", recipe=TINY, **arguments):
-    return Run(method, "B747Lateral", recipe, seed=0, work=folder).run(**arguments)
+    return PolicyTraining(method, build("B747Lateral"), recipe, seed=0, work=folder).run(**arguments)
 
 
 @pytest.fixture(scope="module")
@@ -51,16 +55,18 @@ def test_a_resumed_run_ends_with_the_same_bytes(tiny, tmp_path):
 
 def test_the_stored_actor_is_the_policy(tiny):
     """What the stored actor says of a stream is what the policy says of the observations that it was trained on."""
-    plant, run_ = build("B747Lateral"), Run("ppo", "B747Lateral", TINY, seed=0, work=tiny.parent)
-    venv = run_.venvs[0]
+    plant, training = build("B747Lateral"), PolicyTraining("ppo", build("B747Lateral"), TINY, seed=0, work=tiny.parent)
+    venv = training.venvs[0]
     venv.seed(VALIDATION)
     venv.reset()
-    said = run(make_diagnoser("ppo", plant, path=str(tiny)), fly(plant, SOURCES[0], range(VALIDATION, VALIDATION + 8)).obs)
+    said = run(
+        make_diagnoser("ppo", plant, path=str(tiny)), fly(plant, CONDITIONS[0], range(VALIDATION, VALIDATION + 8)).obs
+    )
     assert (said.label[:, :99] == 0).all()
     for k in range(100, 1200, 100):
         obs, _, _, _ = venv.step(np.zeros(8, int))
         with torch.no_grad():
-            probs = run_.agent.policy.get_distribution(torch.from_numpy(obs)).distribution.probs.numpy()
+            probs = training.agent.policy.get_distribution(torch.from_numpy(obs)).distribution.probs.numpy()
         assert np.allclose(probs, said.label_probs[:, k - 1], atol=1e-5)
         assert np.array_equal(said.label_probs[:, k - 1], said.label_probs[:, k + 98])
 
@@ -82,14 +88,14 @@ def test_tensors_or_a_card_of_another_shape_are_refused(tiny, tmp_path):
 
 
 def test_an_sb3_zip_is_refused(tiny, tmp_path):
-    Run("ppo", "B747Lateral", TINY, seed=0, work=tiny.parent).agent.save(tmp_path / "model.zip")
+    PolicyTraining("ppo", build("B747Lateral"), TINY, seed=0, work=tiny.parent).agent.save(tmp_path / "model.zip")
     (tmp_path / "model.zip").rename(tmp_path / "model.safetensors")
     with pytest.raises(weights.RefusedError, match="zip archive"):
         make_diagnoser("ppo", build("B747Lateral"), path=str(tmp_path / "model.safetensors"))
 
 
 def test_a_policy_estimates(tmp_path):
-    path = trained(tmp_path, "ppo_identification", Recipe(**{**vars(TINY), "task": "identification", "decisions": 64}))
+    path = trained(tmp_path, "ppo_identification", PolicyRecipe(**{**vars(TINY), "task": "identification", "decisions": 64}))
     plant = build("B747Lateral")
     check_diagnoser(lambda p, _: make_diagnoser("ppo_identification", p, path=str(path)), plant, samples=240)
     assert set(weights.read_card(path).curve[0]["accuracy"]) == {"standard rmse", "hard rmse"}
@@ -99,7 +105,7 @@ def test_a_policy_estimates(tmp_path):
 def seen(request):
     """A plant, the shape of a model and the model, identified from a few flights."""
     plant, shape = build(request.param), FAST[request.param]
-    return plant, shape, identified([plant], shape, [fly(plant, SOURCES[0], range(40))])
+    return plant, shape, identified([plant], shape, [fly(plant, CONDITIONS[0], range(40))])
 
 
 def observed(seen, n, **arguments):
@@ -125,7 +131,7 @@ def test_features_are_those_of_each_flight_alone(seen, units):
         """The features of the flight that environment i is on, with those before the first step: (T + 1, n_features)."""
         record = simulate(plant, [envs.unwrapped.scenarios[i]])
         obs = record.obs[:, : int(record.length[0]) + 1]
-        steps = identification.features(plant, shape, model, identification.blocks(plant, obs, shape.stride))[0]
+        steps = features.features(plant, shape, model, features.blocks(plant, obs, shape.stride))[0]
         return np.concatenate([np.zeros_like(steps[:1]), steps])
 
     obs, _ = envs.reset(seed=VALIDATION)
@@ -175,7 +181,7 @@ def test_an_adapter_shows_what_the_environment_shows(period, length, stride):
     obs, _ = envs.reset(seed=VALIDATION)
     expected = [obs, *(envs.step(np.zeros(2, int))[0] for _ in range(12))]
     module = Recorder(5)
-    record = fly(plant, Source("standard", {}), range(VALIDATION, VALIDATION + 2))
+    record = fly(plant, Condition("standard", {}), range(VALIDATION, VALIDATION + 2))
     run(from_torch(module, plant, decision_period=period, length=length, stride=stride), record.obs[:, : 12 * period + 1])
     assert len(module.shown) == 13
     for seen, wanted in zip(module.shown, expected, strict=True):
@@ -187,7 +193,7 @@ def test_a_policy_of_your_own_becomes_a_diagnoser():
     venv = FDIVecEnv(VectorHistory(make_vec_env("B747Lateral-Faults-v0", 4, units="scaled", decision_period=50).envs, 2))
     model = PPO("MlpPolicy", VecMonitor(venv), n_steps=8, batch_size=16, n_epochs=1, seed=0, device="cpu").learn(32)
     diagnoser = from_sb3(model.policy, plant, decision_period=50, length=2)
-    said = run(diagnoser, fly(plant, Source("standard", {}), range(VALIDATION, VALIDATION + 2)).obs[:, :200])
+    said = run(diagnoser, fly(plant, Condition("standard", {}), range(VALIDATION, VALIDATION + 2)).obs[:, :200])
     assert said.label_probs is not None
     assert np.allclose(said.label_probs.sum(axis=2), 1)
 

@@ -438,7 +438,7 @@ def test_an_edited_plant_outside_the_package_gives_new_rows(rows, modules, monke
 
 
 def test_replaced_weights_give_new_rows(rows, tmp_path):
-    weights = pytest.importorskip("baselines.networks.weights")
+    weights = pytest.importorskip("baselines.learned.weights")
     plant = load_suite("small").build()
     own = tmp_path / "own.safetensors"
     source = weights.WEIGHTS / "ppo-B747Lateral.safetensors"
@@ -454,9 +454,9 @@ def test_replaced_weights_give_new_rows(rows, tmp_path):
 
 def test_sources_follow_imports_inside_functions_and_by_name():
     found = sources(["baselines.learned.sequence_net"])
-    assert {"baselines.networks.weights", "baselines.networks.network", "fdi_gym.diagnosis", "fdi_gym.plant"} <= set(found)
+    assert {"baselines.learned.weights", "baselines.learned._supervised", "fdi_gym.diagnosis", "fdi_gym.plant"} <= set(found)
     assert not any(name.split(".")[0] in ("numpy", "torch", "msgspec") for name in found)
-    assert "baselines.filters.two_stage_kf" in found  # it may hear any filter that it finds by name
+    assert "baselines.filters.two_stage_kf" in found  # it may be shown any filter that it finds by name
     other = sources(["baselines.filters.two_stage_kf"])
     assert any(name.startswith("fdi_gym.estimation.") for name in other)
     assert not {"baselines.filters.mekf", "fdi_gym.leaderboard", "fdi_gym.cli"} & set(other)

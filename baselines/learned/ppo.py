@@ -1,20 +1,19 @@
 """Policies trained by PPO (stable-baselines3) on the environments: features of an identified model in, a decision out.
 
-`ppo` isolates; `ppo_identification` estimates. They see what `sequence_net` sees
-(`baselines.networks.identification`), and answer at the end of each step; the answer holds until the next. How they were
-trained is in `baselines.networks.reinforcement`. The committed weights are the actor and the model; neither torch nor
-stable-baselines3 is needed to run them.
+`ppo` isolates; `ppo_identification` estimates. They see what `sequence_net` sees (`baselines.learned.features`) through two
+layers, and answer at the end of each step; the answer holds until the next. How they are trained is in
+`baselines.learned._reinforcement`. The weights are the actor and the model; neither torch nor stable-baselines3 runs them.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-from baselines.learned import network_module
-from fdi_gym.diagnosis import Diagnoser, NotApplicableError, diagnoser
+from baselines.learned import weights
+from baselines.learned.policy import policy_diagnoser, tensor_shapes
+from baselines.learned.recipes import policy_recipe
+from fdi_gym.diagnosis import Diagnoser, diagnoser, trainer
 from fdi_gym.plant import Plant
-from fdi_gym.training import trainer
 
 
 @diagnoser("ppo", "PPO on features of an identified model, delay-aware reward", method="ppo")
@@ -30,30 +29,39 @@ def ppo(plant: Plant, *, method: str = "ppo", path: str = "") -> Diagnoser:
         path: Weights of your own; their card lies beside them.
 
     Raises:
-        NotApplicableError: No weights for this plant and its options, or no safetensors.
+        NotApplicableError: No weights for this plant and its options.
         RefusedError: Weights or a card that are not what they should be.
     """
-    weights, policy, ident = (network_module(name) for name in ("weights", "policy", "identification"))
-    file = Path(path) if path else weights.WEIGHTS / f"{method}-{plant.id}.safetensors"
-    if not file.exists():
-        raise NotApplicableError(f"no trained weights for {plant.id}; train them: fdi-gym train {method} {plant.id}")
-    try:
-        tensors, card = weights.read(file, plant)
-    except weights.WrongPlantError as error:
-        raise NotApplicableError(str(error)) from error
+    file, tensors, card = weights.find(method, plant, path)
     shape, hidden = weights.shape_of(file, card)
-    weights.check_tensors(file, tensors, policy.shapes(plant, shape, card.task, hidden))
-    model = ident.Model(*(tensors[f"model.{name}"] for name in ident.Model._fields))
-    return policy.streaming(plant, shape, model, tensors, card.task)
+    weights.check_tensors(file, tensors, tensor_shapes(plant, shape, card.task, hidden))
+    return policy_diagnoser(plant, shape, tensors, card.task)
 
 
 @trainer("ppo", "PPO on the isolation task")
-def train_ppo(plant_id: str, **arguments: Any) -> Path:
-    """Train the policy that isolates."""
-    return network_module("recipes").train_ppo("ppo", plant_id, **arguments)
+@trainer("ppo_identification", "PPO on the identification task", method="ppo_identification", task="identification")
+def train_ppo(
+    plant: Plant, *, budget: int | None = None, seed: int = 0, work: Path = Path("runs"), threads: int = 1,
+    method: str = "ppo", task: str = "isolation",
+) -> Path:  # fmt: skip
+    """Train a policy; the path of its weights.
 
+    Args:
+        plant: The plant.
+        budget: Decisions. Default: the recipe's.
+        seed: Of the run.
+        work: Folder of runs; one that was killed goes on.
+        threads: Of torch.
+        method: Under which name.
+        task: "isolation" or "identification".
 
-@trainer("ppo_identification", "PPO on the identification task")
-def train_ppo_identification(plant_id: str, **arguments: Any) -> Path:
-    """Train the policy that estimates."""
-    return network_module("recipes").train_ppo("ppo_identification", plant_id, **arguments)
+    Raises:
+        ValueError: The folder holds another run.
+    """
+    from baselines.learned._reinforcement import PolicyTraining
+    from baselines.learned._training import command
+
+    return PolicyTraining(
+        method, plant, policy_recipe(plant, task, budget), seed=seed, work=work / f"{method}-{plant.id}-{seed}",
+        command=command(method, plant, budget, seed), threads=threads,
+    ).run()  # fmt: skip

@@ -1,28 +1,36 @@
-"""A recurrent network over blocks of observations, and one that hears filters too: trained under supervision.
+"""A recurrent network over steps of several samples, and one that is shown filters too: trained under supervision.
 
-The network sees what `baselines.networks.identification` makes of the samples so far and answers at the end of each
-block; the answer holds until the next. It was trained with labels of equal weight, so its most probable label is the one
-that balanced accuracy asks for: that is the label it declares. The probabilities are calibrated for the process it
-expects (scale, bias per label), so the most probable label may be another where a label is rare.
+The network sees what `baselines.learned.features` makes of the samples so far and answers at the end of each step; the
+answer holds until the next. It was trained with labels of equal weight, so its most probable label is the one that balanced
+accuracy asks for: that is the label it declares. The probabilities are calibrated for the process it expects (scale, bias
+per label), so the most probable label may be another where a label is rare.
 
-It is told which fault process to expect, as the filters are; one that it was not trained on it takes for the first.
+It is told which fault process to expect, as the filters are; one that it was not trained on it takes for the first. It runs
+on NumPy; torch trains it (`baselines.learned._supervised`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from baselines.learned import network_module
-from fdi_gym.diagnosis import Diagnoser, Diagnosis, NotApplicableError, diagnoser, diagnosers, make_diagnoser
+from baselines.learned import features as feat
+from baselines.learned import weights
+from baselines.learned.flights import filter_features
+from baselines.learned.probabilities import log_softmax
+from baselines.learned.recipes import residual_recipe, sequence_recipe
+from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser, diagnosers, make_diagnoser, trainer
 from fdi_gym.plant import Array, Plant
-from fdi_gym.training import trainer
+
+REACH = 10.0  # trust in filters is learned so many times faster than the rest: it must rise and fall by several logits
+LOG_STD = (-6.0, 3.0)  # bounds of the estimate's log standard deviation
 
 
 @diagnoser("sequence_net", "Recurrent network on observations, supervised", method="sequence_net")
-@diagnoser("residual_net", "Recurrent network that hears filters too, supervised", method="residual_net")
+@diagnoser("residual_net", "Recurrent network that is shown filters too, supervised", method="residual_net")
 def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "standard", path: str = "") -> Diagnoser:
     """The trained network.
 
@@ -34,76 +42,138 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
 
     Raises:
         ValueError: The plant has no such process.
-        NotApplicableError: No weights for this plant and its options, or no torch.
+        NotApplicableError: No weights for this plant and its options.
         RefusedError: Weights or a card that are not what they should be.
     """
-    weights, network, ident, flights, calibration = (
-        network_module(name) for name in ("weights", "network", "identification", "flights", "calibration")
-    )
-    import torch
-
     plant.process(process)
-    file = Path(path) if path else weights.WEIGHTS / f"{method}-{plant.id}.safetensors"
-    if not file.exists():
-        raise NotApplicableError(f"no trained weights for {plant.id}; train them: fdi-gym train {method} {plant.id}")
-    try:
-        tensors, card = weights.read(file, plant)
-    except weights.WrongPlantError as error:
-        raise NotApplicableError(str(error)) from error
+    file, tensors, card = weights.find(method, plant, path)
     expected = process if process in card.processes else card.processes[0]
     shape, hidden = weights.shape_of(file, card)
     entries = diagnosers()
     for name in card.filters:  # never "module:function", which would be imported
         if name not in entries or entries[name].clairvoyant:
-            raise weights.RefusedError(f"{file.with_suffix('.json')} names {name!r}, which is no filter that can be heard")
-    inputs, processes = weights.width_of(file, tensors, "network.value.weight"), len(card.processes)
-    direct = weights.width_of(file, tensors, "network.direct.weight") if "network.direct.weight" in tensors else 0
-    words = (direct // processes,) if direct else ()
-    size = (inputs, len(plant.labels), len(plant.estimated), hidden, words, processes)
-    net = network.SequenceNetwork(*size).double()
-    sizes = {f"network.{name}": tuple(value.shape) for name, value in net.state_dict().items()}
-    weights.check_tensors(file, tensors, sizes | ident.shapes(plant, shape))
-    net.load_state_dict({name: torch.from_numpy(tensors[f"network.{name}"]) for name in net.state_dict()})
-    model = ident.Model(*(tensors[f"model.{name}"] for name in ident.Model._fields))
-    context = np.eye(processes)[card.processes.index(expected)]
-    fitted = weights.fitted_of(file, card, expected)
-    scale, bias, prior = fitted.scale, np.array(fitted.bias), np.array(fitted.prior)
+            raise weights.RefusedError(f"{file.with_suffix('.json')} names {name!r}, which is no filter that can be shown")
+    filters = [make_diagnoser(name, plant, process=expected) for name in card.filters]
+    trim = np.array([[s.nominal for s in plant.observed]])
+    told = sum(filter_features(plant, f.update(f.init(1), trim)[1]).shape[1] for f in filters)
+    weights.check_tensors(file, tensors, tensor_shapes(plant, shape, hidden, told, len(card.processes)))
+    model = weights.model_of(tensors)
+    net = {name.removeprefix("network."): value.astype(float) for name, value in tensors.items()}
+    context = np.eye(len(card.processes))[card.processes.index(expected)]
+    calibration = weights.calibration_of(file, card, expected)
+    scale, bias, prior = calibration.scale, np.array(calibration.bias), np.array(calibration.prior)
     healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
     unit = np.array([s.scale for s in plant.estimated])
-    heard = [make_diagnoser(name, plant, process=expected) for name in card.filters]
 
     def init(n: int) -> Any:
-        said = Diagnosis(np.zeros(n, bool), np.zeros(n, np.int64), np.tile(healthy, (n, 1)), np.tile(unit, (n, 1)),
-                         np.tile(prior / prior.sum(), (n, 1)))  # fmt: skip
-        return 0, ident.begin(plant, shape, n), np.zeros((n, hidden)), [f.init(n) for f in heard], said
+        first = Diagnosis(np.zeros(n, bool), np.zeros(n, np.int64), np.tile(healthy, (n, 1)), np.tile(unit, (n, 1)),
+                          np.tile(prior / prior.sum(), (n, 1)))  # fmt: skip
+        return 0, feat.begin(plant, shape, n), np.zeros((n, hidden)), [f.init(n) for f in filters], first
 
-    def answer(features: Array, h: Array) -> tuple[Array, Diagnosis]:
-        with torch.inference_mode():
-            x = torch.from_numpy(features[:, None])
-            logits, mean, log_std, memory = (a.numpy() for a in net(x, torch.from_numpy(h[None])))
-        mode = logits[:, 0].argmax(axis=1)
-        probs = np.exp(calibration.log_softmax(scale * logits[:, 0] + bias))
-        return memory[0], Diagnosis(mode > 0, mode, healthy + unit * mean[:, 0], unit * np.exp(log_std[:, 0]), probs)
+    def answer(x: Array, h: Array) -> tuple[Array, Diagnosis]:
+        logits, mean, log_std, h = forward(net, x, h, len(plant.labels), len(context))
+        label = logits.argmax(axis=1)
+        probs = np.exp(log_softmax(scale * logits + bias))
+        return h, Diagnosis(label > 0, label, healthy + unit * mean, unit * np.exp(log_std), probs)
 
     def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
-        k, stream, h, inner, said = state
-        stream, seen = ident.add(plant, shape, model, stream, obs, k)
-        further = [f.update(own, obs) for f, own in zip(heard, inner, strict=True)]
-        if seen is not None:
-            parts = [seen, np.tile(context, (len(obs), 1)), *(flights.word(plant, word) for _, word in further)]
-            h, said = answer(np.concatenate(parts, axis=1), h)
-        return (k + 1, stream, h, [own for own, _ in further], said), said
+        k, stream, h, inner, diagnosis = state
+        stream, features = feat.add(plant, shape, model, stream, obs, k)
+        further = [f.update(own, obs) for f, own in zip(filters, inner, strict=True)]
+        if features is not None:
+            parts = [features, np.tile(context, (len(obs), 1)), *(filter_features(plant, own) for _, own in further)]
+            h, diagnosis = answer(np.concatenate(parts, axis=1), h)
+        return (k + 1, stream, h, [own for own, _ in further], diagnosis), diagnosis
 
     return Diagnoser(init, update)
 
 
 @trainer("sequence_net", "Recurrent network on observations, supervised")
-def train_sequence_net(plant_id: str, **arguments: Any) -> Path:
-    """Train the network on observations."""
-    return network_module("recipes").train("sequence_net", plant_id, **arguments)
+@trainer("residual_net", "The network that is shown filters too; starts from sequence_net", method="residual_net")
+def train_sequence_net(
+    plant: Plant, *, budget: int | None = None, seed: int = 0, work: Path = Path("runs"), threads: int = 1,
+    method: str = "sequence_net",
+) -> Path:  # fmt: skip
+    """Train the network; the path of its weights.
+
+    Args:
+        plant: The plant.
+        budget: Training flights per condition. Default: the recipe's.
+        seed: Of the run; each has training seeds of its own.
+        work: Folder of runs; one that was killed goes on. "residual_net" starts from the weights of "sequence_net" there,
+            or else from those that ship.
+        threads: Of torch.
+        method: "sequence_net" or "residual_net".
+
+    Raises:
+        ValueError: There is no network to start from, or the folder holds another run.
+    """
+    from baselines.learned._supervised import SupervisedTraining
+    from baselines.learned._training import command
+
+    recipe = (residual_recipe if method == "residual_net" else sequence_recipe)(plant, budget)
+    file = f"sequence_net-{plant.id}.safetensors"
+    own = work / f"sequence_net-{plant.id}-{seed}" / file
+    return SupervisedTraining(
+        method, plant, recipe, seed=seed, work=work / f"{method}-{plant.id}-{seed}",
+        base=own if own.exists() else weights.WEIGHTS / file, command=command(method, plant, budget, seed), threads=threads,
+    ).run()  # fmt: skip
 
 
-@trainer("residual_net", "The network that hears filters too; starts from sequence_net")
-def train_residual_net(plant_id: str, **arguments: Any) -> Path:
-    """Train the network that hears filters."""
-    return network_module("recipes").train("residual_net", plant_id, **arguments)
+def tensor_shapes(
+    plant: Plant, shape: feat.FeatureShape, hidden: int, told: int, processes: int
+) -> dict[str, tuple[int, ...]]:  # fmt: skip
+    """The shapes of all arrays of a stored network, `told` entries by filters: the network's and the model's."""
+    model = feat.tensor_shapes(plant, shape)
+    inputs, labels = model["model.mean"][0] + processes + told, len(plant.labels)
+    layers = {
+        "value": (hidden, inputs), "gate": (hidden, inputs), "join": (hidden, inputs + hidden), "read": (hidden, hidden),
+        "heads": (labels + 2 * len(plant.estimated), hidden),
+    }  # fmt: skip
+    found = {f"network.{name}.weight": size for name, size in layers.items()}
+    found |= {f"network.{name}.bias": size[:1] for name, size in layers.items()}
+    for end in ("ih", "hh"):
+        found |= {f"network.memory.weight_{end}_l0": (3 * hidden, hidden), f"network.memory.bias_{end}_l0": (3 * hidden,)}
+    if told:
+        found["network.direct.weight"] = (labels, processes * told)
+    return found | model
+
+
+def _sigmoid(x: Array) -> Array:
+    return 0.5 + 0.5 * np.tanh(0.5 * x)
+
+
+def forward(
+    net: Mapping[str, Array], x: Array, h: Array, labels: int, processes: int
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+    """One step of the network that `_network.SequenceNetwork` trains.
+
+    Args:
+        net: Its tensors.
+        x: Features (n, inputs): those of the model, the process (n, processes), and those of filters.
+        h: Memory (n, hidden).
+        labels: Labels of the plant.
+        processes: Fault processes that it knows.
+
+    Returns:
+        logits (n, labels), mean and log standard deviation of the deviation (n, n_estimated), memory (n, hidden)
+    """
+
+    def linear(name: str, a: Array) -> Array:
+        return a @ net[f"{name}.weight"].T + net[f"{name}.bias"]
+
+    product = linear("value", x) * np.tanh(linear("gate", x))
+    joined = linear("join", np.concatenate([x, product], axis=1))
+    seen = joined * _sigmoid(joined)
+    reset, keep, new = np.split(seen @ net["memory.weight_ih_l0"].T + net["memory.bias_ih_l0"], 3, axis=1)
+    reset_h, keep_h, new_h = np.split(h @ net["memory.weight_hh_l0"].T + net["memory.bias_hh_l0"], 3, axis=1)
+    keep = _sigmoid(keep + keep_h)
+    h = (1 - keep) * np.tanh(new + _sigmoid(reset + reset_h) * new_h) + keep * h
+    read = linear("read", seen + h)
+    out = linear("heads", read * _sigmoid(read))
+    logits, (mean, log_std) = out[:, :labels], np.split(out[:, labels:], 2, axis=1)
+    if "direct.weight" in net:
+        told = net["direct.weight"].shape[1] // processes
+        process, filters = x[:, -told - processes : -told], x[:, -told:]
+        logits = logits + REACH * (process[:, :, None] * filters[:, None]).reshape(len(x), -1) @ net["direct.weight"].T
+    return logits, mean, np.clip(log_std, *LOG_STD), h

@@ -1,4 +1,4 @@
-"""Diagnosers by name: how a builder is made known, found, told what it may know, and built.
+"""Methods by name: how a diagnoser's builder or a trainer is made known and found, and what it takes.
 
 A builder makes a diagnoser from a plant and from data; it flies nothing and reads no file:
 
@@ -8,9 +8,15 @@ A builder makes a diagnoser from a plant and from data; it flies nothing and rea
     @diagnoser("augmented_ekf", "Augmented extended Kalman filter")
     def augmented_ekf(plant: Plant, belief: Belief, calibration: Calibration, *, walk: float = 1.0) -> Diagnoser: ...
 
-Arguments of these names are given: `belief` and `calibration` are what `fdi_gym.diagnosis.fitting` found for the fault
-process that will be met, `process` is that process's name, `scenarios` the truth, for ceilings only. All others are tuning.
-Builders in the modules and packages of the entry-point group "fdi_gym.diagnosers" are discovered; none is listed.
+A trainer makes weights for a diagnoser, in a folder of runs; it gives the path of the .safetensors file, whose card lies
+beside it:
+
+    @trainer("sequence_net", "Recurrent network, supervised")
+    def train_sequence_net(plant: Plant, *, budget: int | None, seed: int, work: Path, threads: int) -> Path: ...
+
+Arguments of the names in `GIVEN` are given to those that have them; all others are settings. Modules and packages of the
+entry-point group "fdi_gym.diagnosers" are imported to find both; none is listed. A module whose name begins with "_" is
+left for those that need it, with whatever slow library it imports.
 """
 
 from __future__ import annotations
@@ -20,59 +26,67 @@ import importlib
 import inspect
 import json
 import pkgutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-from fdi_gym.diagnosis.contract import Diagnoser
-from fdi_gym.diagnosis.guard import guarded
 from fdi_gym.names import blame, check_diagnoser_name, find_function, unknown
 from fdi_gym.plant import Plant
 
-GIVEN = {  # arguments of a builder that are no tuning
-    "belief": "what it may assume of the plant, fitted to the process",
-    "calibration": "when it alarms, fitted to the process",
-    "process": "the fault process that will be met",
-    "scenarios": "the truth: it is clairvoyant",
+Kind = Literal["diagnoser", "trainer"]
+GIVEN: dict[Kind, dict[str, str]] = {  # arguments that are no settings
+    "diagnoser": {
+        "belief": "what it may assume of the plant, fitted to the process",
+        "calibration": "when it alarms, fitted to the process",
+        "process": "the fault process that will be met",
+        "scenarios": "the truth: it is clairvoyant",
+    },
+    "trainer": {
+        "budget": "how much to train, in its own measure; None for its recipe's",
+        "seed": "of the run",
+        "work": "folder of runs: checkpoints, logs, weights and cards",
+        "threads": "of the library that trains",
+    },
 }
 
 
 class Entry(NamedTuple):
-    """A diagnoser that can be asked for by name."""
+    """A diagnoser or a trainer that can be asked for by name."""
 
+    kind: Kind
     name: str
     summary: str
-    build: Callable[..., Diagnoser]
+    build: Callable[..., Any]  # the builder of the diagnoser, or the function that trains
     settings: Mapping[str, Any]  # that belong to the name
-    clairvoyant: bool
+    clairvoyant: bool = False
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """The keywords of its builder, without the plant."""
+        """The keywords of its function, without the plant."""
         return tuple(inspect.signature(self.build).parameters)[1:]
 
     def takes(self, argument: str) -> bool:
-        """Whether its builder has this argument."""
+        """Whether its function has this argument."""
         return argument in self.parameters
 
-    def resolve(self, plant: Plant, **tuning: Any) -> dict[str, Any]:
-        """All tuning that its builder gets: the caller's over the name's over the paper's own for this plant.
+    def resolve(self, plant: Plant, **settings: Any) -> dict[str, Any]:
+        """All settings that its function gets: the caller's over the name's over the paper's own for this plant.
 
         Raises:
-            ValueError: The builder has no such keyword.
+            ValueError: The function has no such keyword.
         """
-        asked = {**self.settings, **tuning}
-        settings = {**paper_tuning(self, plant, asked), **asked}
-        allowed = [name for name in self.parameters if name not in GIVEN]
-        for key in settings:
+        asked = {**self.settings, **settings}
+        found = {**paper_tuning(self, plant, asked), **asked} if self.kind == "diagnoser" else asked
+        allowed = [name for name in self.parameters if name not in GIVEN[self.kind]]
+        for key in found:
             if key not in allowed:
                 raise ValueError(f"{self.name} has no setting {key!r}; it has {', '.join(allowed) or 'none'}")
-        return settings
+        return found
 
 
 def package_of(entry: Entry) -> Path | None:
-    """The folder of the package that a diagnoser belongs to; None where there is none."""
+    """The folder of the package that a method belongs to; None where there is none."""
     name = entry.build.__module__.split(".")[0]
     file = getattr(importlib.import_module(name), "__file__", None)
     return Path(file).parent if file else None
@@ -107,7 +121,7 @@ def paper_tuning(entry: Entry, plant: Plant, asked: Mapping[str, Any]) -> dict[s
     return found
 
 
-_entries: dict[str, Entry] = {}
+_entries: dict[Kind, dict[str, Entry]] = {"diagnoser": {}, "trainer": {}}
 
 
 def diagnoser(name: str, summary: str, *, clairvoyant: bool = False, **settings: Any) -> Callable[[Any], Any]:
@@ -122,21 +136,30 @@ def diagnoser(name: str, summary: str, *, clairvoyant: bool = False, **settings:
     Raises:
         ValueError: The name is taken, or the builder has no such keyword.
     """
+    return functools.partial(_register, "diagnoser", name, summary, settings, clairvoyant)
 
-    def register(build: Callable[..., Diagnoser]) -> Callable[..., Diagnoser]:
-        taken = _entries.get(name)
-        if taken is not None and (taken.build.__module__, taken.build.__qualname__) != (
-            build.__module__, build.__qualname__,
-        ):  # fmt: skip
-            raise ValueError(f"two diagnosers are called {name!r}: {taken.build.__module__} and {build.__module__}")
-        allowed = inspect.signature(build).parameters
-        for setting in settings:
-            if setting not in allowed:
-                raise ValueError(f"{build.__name__} has no setting {setting!r}; it has {', '.join(allowed)}")
-        _entries[name] = Entry(name, summary, build, settings, clairvoyant)
-        return build
 
-    return register
+def trainer(name: str, summary: str, **settings: Any) -> Callable[[Any], Any]:
+    """Make a training function known under a name, as `diagnoser` does with a builder.
+
+    Raises:
+        ValueError: As there.
+    """
+    return functools.partial(_register, "trainer", name, summary, settings, False)
+
+
+def _register(
+    kind: Kind, name: str, summary: str, settings: Mapping[str, Any], clairvoyant: bool, build: Callable[..., Any]
+) -> Callable[..., Any]:
+    taken = _entries[kind].get(name)
+    if taken is not None and (taken.build.__module__, taken.build.__qualname__) != (build.__module__, build.__qualname__):
+        raise ValueError(f"two {kind}s are called {name!r}: {taken.build.__module__} and {build.__module__}")
+    allowed = inspect.signature(build).parameters
+    for setting in settings:
+        if setting not in allowed:
+            raise ValueError(f"{build.__name__} has no setting {setting!r}; it has {', '.join(allowed)}")
+    _entries[kind][name] = Entry(kind, name, summary, build, settings, clairvoyant)
+    return build
 
 
 @functools.cache
@@ -154,14 +177,40 @@ def broken_plugins() -> dict[str, str]:
     for entry_point in entry_points(group="fdi_gym.diagnosers"):
         place = load(entry_point.value, entry_point.load)
         for module in pkgutil.walk_packages(getattr(place, "__path__", []), f"{entry_point.value}.", onerror=lambda _: None):
-            load(module.name, functools.partial(importlib.import_module, module.name))
+            if "._" not in module.name:
+                load(module.name, functools.partial(importlib.import_module, module.name))
     return broken
+
+
+def _known(kind: Kind) -> dict[str, Entry]:
+    broken_plugins()  # imports the modules in which they are
+    return dict(_entries[kind])
 
 
 def diagnosers() -> dict[str, Entry]:
     """All diagnosers by name, in the order in which their modules declare them."""
-    broken_plugins()  # imports the modules in which they are
-    return dict(_entries)
+    return _known("diagnoser")
+
+
+def trainers() -> dict[str, Entry]:
+    """All trainers by name, in the order in which their modules declare them."""
+    return _known("trainer")
+
+
+def _find(kind: Kind, name: str) -> Entry:
+    if ":" in name:
+        build = find_function(kind, check_diagnoser_name(name))
+        try:
+            arguments = inspect.signature(build).parameters
+        except (ValueError, TypeError):  # a builtin
+            arguments = {}
+        if not arguments:
+            raise ValueError(f"{name} is no {'builder of a diagnoser' if kind == 'diagnoser' else kind}: it takes no plant")
+        return Entry(kind, name, (inspect.getdoc(build) or name).splitlines()[0], build, {})
+    found = _known(kind)
+    if name not in found:
+        raise unknown(kind, name, found)
+    return found[name]
 
 
 def find_diagnoser(name: str) -> Entry:
@@ -170,56 +219,13 @@ def find_diagnoser(name: str) -> Entry:
     Raises:
         ValueError: There is none; the message lists those that exist.
     """
-    if ":" in name:
-        build = find_function("diagnoser", check_diagnoser_name(name))
-        try:
-            arguments = inspect.signature(build).parameters
-        except (ValueError, TypeError):  # a builtin
-            arguments = {}
-        if not arguments:
-            raise ValueError(f"{name} is no builder of a diagnoser: it takes no plant")
-        return Entry(name, (inspect.getdoc(build) or name).splitlines()[0], build, {}, False)
-    found = diagnosers()
-    if name not in found:
-        raise unknown("diagnoser", name, found)
-    return found[name]
+    return _find("diagnoser", name)
 
 
-def make_diagnoser(
-    name: str, plant: Plant, *, process: str = "standard", scenarios: Sequence[Any] | None = None, **tuning: Any
-) -> Diagnoser:
-    """A diagnoser by name, for a plant and one of its fault processes, under the guard (see `guarded`).
-
-    What it believes and when it alarms is what `fdi_gym.diagnosis.fitting` found for that process: shipped where it is, else
-    found when it is first asked for.
-
-    Args:
-        name: As in `find_diagnoser`.
-        plant: The plant whose model it gets.
-        process: The fault process that it will meet.
-        scenarios: The truth, one per episode; only a clairvoyant one gets it.
-        tuning: Keyword arguments of its builder, over those of the name, which are over its paper's own for the plant.
+def find_trainer(name: str) -> Entry:
+    """The trainer of this name; "module:function" names one that is not discovered.
 
     Raises:
-        ValueError: Unknown name, process or keyword; `NotApplicableError` where the method cannot run on this plant.
+        ValueError: There is none; the message lists those that exist.
     """
-    from fdi_gym.diagnosis.knowledge import knowledge_of
-
-    entry = find_diagnoser(name)
-    plant.process(process)
-    settings = entry.resolve(plant, **tuning)
-    given: dict[str, Any] = {"process": process} if entry.takes("process") else {}
-    if entry.clairvoyant:
-        if scenarios is None:
-            raise ValueError(f"{name} knows the truth: it needs scenarios, one per episode")
-        given["scenarios"] = scenarios
-    try:
-        given |= knowledge_of(entry, plant, process, settings)
-        built = entry.build(plant, **given, **settings)
-    except ValueError:
-        raise
-    except Exception as error:
-        raise ValueError(f"the builder of {name} failed: {blame(error)}") from error
-    if not isinstance(built, Diagnoser):
-        raise ValueError(f"the builder of {name} gives {type(built).__name__}, not a Diagnoser")
-    return guarded(built, plant)
+    return _find("trainer", name)

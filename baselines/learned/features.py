@@ -22,7 +22,6 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.signal
 
 from fdi_gym.plant import Array, Plant
 
@@ -32,7 +31,7 @@ FAR = 20.0  # blocks with a scaled signal beyond this (a flight that diverges) t
 KNEE = 4.0  # products are of signals that saturate smoothly here
 
 
-class Shape(NamedTuple):
+class FeatureShape(NamedTuple):
     """What the model is made of: samples per block, past blocks in phi, and the degree of the products in phi and psi.
 
     Products are of the present signals and the outputs' magnitudes; a degree of 1 has none.
@@ -50,7 +49,7 @@ class Shape(NamedTuple):
         return self.stride * self.every
 
 
-class Model(NamedTuple):
+class FeatureModel(NamedTuple):
     """The identified model, and mean and standard deviation of the features over training flights. All float32."""
 
     W: Array  # (n_y, n_phi)
@@ -85,7 +84,7 @@ def _products(width: int, degree: int) -> list[Array]:
     ]
 
 
-def regressors(plant: Plant, shape: Shape, past: Array, now: Array) -> tuple[Array, Array]:
+def regressors(plant: Plant, shape: FeatureShape, past: Array, now: Array) -> tuple[Array, Array]:
     """phi (..., n_phi), psi (..., n_psi) of a block (..., 2, n_obs) and those before, newest first (..., lags, 2, n_obs)."""
     n_y = len(plant.outputs)
     held = now[..., 0, n_y:]
@@ -97,13 +96,13 @@ def regressors(plant: Plant, shape: Shape, past: Array, now: Array) -> tuple[Arr
     return np.concatenate(phi, axis=-1), np.concatenate([one, here, *products[: shape.effects - 1]], axis=-1)
 
 
-def _sequences(plant: Plant, shape: Shape, z: Array) -> tuple[Array, Array]:
+def _sequences(plant: Plant, shape: FeatureShape, z: Array) -> tuple[Array, Array]:
     """The regressors of the blocks lags, lags + 1, ... of whole flights z (N, T, 2, n_obs)."""
     p, T = shape.lags, z.shape[1]
     return regressors(plant, shape, np.stack([z[:, p - 1 - i : T - 1 - i] for i in range(p)], axis=2), z[:, p:])
 
 
-def identify(plant: Plant, shape: Shape, flights: Iterable[tuple[Array, Array]]) -> Model:
+def identify(plant: Plant, shape: FeatureShape, flights: Iterable[tuple[Array, Array]]) -> FeatureModel:
     """Fit the model to flights: pairs of blocks (N, T, 2, n_obs) and their deviations (N, T, n_estimated).
 
     The features' mean and standard deviation are left at 0 and 1: `standardised` sets them.
@@ -130,10 +129,11 @@ def identify(plant: Plant, shape: Shape, flights: Iterable[tuple[Array, Array]])
     whiten = (directions / np.sqrt(np.maximum(power, 1e-12))) @ directions.T
     V = C[n_phi:].reshape(-1, n_psi, n_y).transpose(0, 2, 1)
     width = 2 * len(plant.observed) + n_y + len(MEMORIES) * (3 * len(V) + 1)
-    return Model(*(np.ascontiguousarray(a, np.float32) for a in (C[:n_phi].T, V, whiten, np.zeros(width), np.ones(width))))
+    arrays = (C[:n_phi].T, V, whiten, np.zeros(width), np.ones(width))
+    return FeatureModel(*(np.ascontiguousarray(a, np.float32) for a in arrays))
 
 
-def shapes(plant: Plant, shape: Shape) -> dict[str, tuple[int, ...]]:
+def tensor_shapes(plant: Plant, shape: FeatureShape) -> dict[str, tuple[int, ...]]:
     """The shapes of a model's arrays as they lie in a weight file."""
     n, n_y, p = len(plant.observed), len(plant.outputs), len(plant.estimated)
     sizes = [len(which) for which in _products(n + n_y, max(shape.degree, shape.effects))]
@@ -143,7 +143,7 @@ def shapes(plant: Plant, shape: Shape) -> dict[str, tuple[int, ...]]:
     return {f"model.{name}": value for name, value in found.items()}
 
 
-def information(model: Model, phi: Array, psi: Array, y: Array) -> tuple[Array, Array, Array]:
+def information(model: FeatureModel, phi: Array, psi: Array, y: Array) -> tuple[Array, Array, Array]:
     """Whitened residuals e (..., n_y), S'e (..., p) and S'S (..., p, p) of mean outputs y (..., n_y)."""
     e = (y - phi @ model.W.T.astype(float)) @ model.whiten.T.astype(float)
     S = psi @ np.einsum("ab,jbx->xaj", model.whiten, model.V).astype(float).reshape(psi.shape[-1], -1)
@@ -162,8 +162,10 @@ def estimates(g: Array, info: Array) -> Array:
     return found.reshape(*found.shape[:-2], -1)
 
 
-def features(plant: Plant, shape: Shape, model: Model, z: Array) -> Array:
+def features(plant: Plant, shape: FeatureShape, model: FeatureModel, z: Array) -> Array:
     """Whole flights z (N, T, 2, n_obs) as a network sees them (N, T // every, n_features), float32."""
+    import scipy.signal  # takes a second, and only training comes here
+
     m, T = shape.every, z.shape[1] // shape.every * shape.every
     z = z[:, :T]
     phi, psi = _sequences(plant, shape, z)
@@ -183,13 +185,15 @@ def features(plant: Plant, shape: Shape, model: Model, z: Array) -> Array:
     )
 
 
-def _assembled(shape: Shape, model: Model, mean: Array, newest: Array, e: Array, g: Array, info: Array) -> Array:
+def _assembled(
+    shape: FeatureShape, model: FeatureModel, mean: Array, newest: Array, e: Array, g: Array, info: Array
+) -> Array:  # fmt: skip
     """The features of steps, from the means and newest samples, the sums of residuals, and the forgotten sums."""
     seen = [np.arcsinh(mean), np.arcsinh(newest), np.arcsinh(e / np.sqrt(shape.every)), estimates(g, info)]
     return (np.concatenate(seen, axis=-1) - model.mean) / model.std
 
 
-def standardised(plant: Plant, shape: Shape, model: Model, z: Array) -> Model:
+def standardised(plant: Plant, shape: FeatureShape, model: FeatureModel, z: Array) -> FeatureModel:
     """The model with the features' mean and standard deviation over these flights."""
     seen = features(plant, shape, model, z).reshape(-1, len(model.mean)).astype(float)
     return model._replace(mean=np.float32(seen.mean(axis=0)), std=np.float32(seen.std(axis=0) + 1e-3))
@@ -209,7 +213,7 @@ class Stream(NamedTuple):
     residuals: Array  # (n, n_y) and of their residuals
 
 
-def begin(plant: Plant, shape: Shape, n: int) -> Stream:
+def begin(plant: Plant, shape: FeatureShape, n: int) -> Stream:
     """The state before the first sample."""
     p, M, width = len(plant.estimated), len(MEMORIES), len(plant.observed)
     return Stream(
@@ -218,7 +222,9 @@ def begin(plant: Plant, shape: Shape, n: int) -> Stream:
     )  # fmt: skip
 
 
-def add(plant: Plant, shape: Shape, model: Model, stream: Stream, obs: Array, k: int) -> tuple[Stream, Array | None]:
+def add(
+    plant: Plant, shape: FeatureShape, model: FeatureModel, stream: Stream, obs: Array, k: int
+) -> tuple[Stream, Array | None]:  # fmt: skip
     """Sample k (n, n_obs): the state after it and, at the end of a step, what `features` has there (n, n_features)."""
     newest = scaled(plant, obs)
     stream = stream._replace(count=stream.count + 1, total=stream.total + newest)
@@ -232,7 +238,7 @@ def add(plant: Plant, shape: Shape, model: Model, stream: Stream, obs: Array, k:
     return stream._replace(**dict(zip(("blocks", "means", "residuals"), zeros, strict=True))), seen
 
 
-def _close_block(plant: Plant, shape: Shape, model: Model, stream: Stream, newest: Array) -> Stream:
+def _close_block(plant: Plant, shape: FeatureShape, model: FeatureModel, stream: Stream, newest: Array) -> Stream:
     now = np.stack([stream.total / stream.count[:, None], newest], axis=1)
     phi, psi = regressors(plant, shape, stream.past, now)
     e, g, info = information(model, phi, psi, now[:, 0, : len(plant.outputs)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.optimize
 
 from fdi_gym.plant import Array
 
@@ -41,6 +40,8 @@ def fit(logits: Array, label: Array, prior: Array) -> tuple[float, Array]:
     Returns:
         scale, bias (labels,)
     """
+    import scipy.optimize
+
     start = np.concatenate([[1.0], np.log(prior)])
     onehot = np.eye(logits.shape[1])[label]
 

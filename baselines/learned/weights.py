@@ -8,32 +8,26 @@ from __future__ import annotations
 
 import hashlib
 import subprocess
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load, save
 
-from baselines.networks.identification import Shape
+from baselines.learned.features import FeatureModel, FeatureShape
 from fdi_gym.files import RefusedError, read_bytes, read_json, write_whole
-from fdi_gym.plant import Array, Plant
+from fdi_gym.plant import Array, NotApplicableError, Plant
 
-WEIGHTS = Path(__file__).parent.parent / "learned" / "weights"
-
+WEIGHTS = Path(__file__).parent / "weights"
 
 # upper ends of what a card may ask for, so that no card makes the building of a network take all memory
 SIZES = {"stride": 1000, "lags": 1000, "degree": 3, "effects": 3, "every": 1000, "hidden": 1024}
 LARGEST, LARGEST_CARD = 2**28, 2**20  # bytes
 
 
-class WrongPlantError(RefusedError):
-    """Weights that are in order, but of another plant or other options."""
-
-
-class Fitted(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ProbabilityCalibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A calibration for one process.
 
     Args:
@@ -70,7 +64,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         labels, observed, estimated: Names, in order.
         task: "isolation", "identification" or "both".
         shape: What the network is made of.
-        filters: The diagnosers whose words it hears.
+        filters: The diagnosers that it is shown.
         seeds: First and last seed of the training, validation and calibration flights.
         budget: What was used: flights, samples, steps, seconds.
         curve: The training curve: one entry per validation.
@@ -81,7 +75,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         sha256: Digest of the weight file.
 
     Raises:
-        ValueError: No process, or more filters than any network hears.
+        ValueError: No process, or more filters than any network is shown.
     """
 
     schema: Literal[1] = 1
@@ -99,7 +93,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     seeds: dict[str, list[int]]
     budget: dict[str, float]
     curve: list[dict[str, Any]]
-    calibration: dict[str, Fitted] = {}
+    calibration: dict[str, ProbabilityCalibration] = {}
     command: str
     revision: str
     versions: dict[str, str]
@@ -109,7 +103,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         if not 1 <= len(self.processes) <= 100 or len(set(self.processes)) < len(self.processes):
             raise ValueError("weights are for 1 to 100 different processes")
         if len(self.filters) > 16:
-            raise ValueError("a network hears up to 16 filters")
+            raise ValueError("a network is shown up to 16 filters")
 
 
 def names(plant: Plant) -> dict[str, list[str]]:
@@ -131,6 +125,8 @@ def made_with() -> tuple[str, dict[str, str]]:
 
 def write(path: Path, tensors: dict[str, Array], card: Card) -> None:
     """Write weights and their card, `path` with .safetensors and with .json."""
+    from safetensors.numpy import save
+
     content = save({name: np.asarray(a, order="C") for name, a in tensors.items()})
     card = msgspec.structs.replace(card, sha256=hashlib.sha256(content).hexdigest())
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -154,6 +150,9 @@ def _content(path: Path) -> bytes:
 
 
 def _tensors(path: Path, content: bytes) -> dict[str, Array]:
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
     for magic, what in ((b"\x80", "a pickle"), (b"PK", "a zip archive (torch or stable-baselines3)")):
         if content.startswith(magic) and not content[8:9] == b"{":
             raise RefusedError(f"{path} is {what}, which can run code when it is read; weights are safetensors")
@@ -185,41 +184,67 @@ def read(path: Path, plant: Plant) -> tuple[dict[str, Array], Card]:
     """Weights for a plant, checked against their card.
 
     Raises:
-        RefusedError: The file, the card, or the two together are not what they should be; `WrongPlantError` where they
-            are, but for another plant.
+        RefusedError: The file, the card, or the two together are not what they should be.
+        NotApplicableError: They are, but for another plant or other options.
     """
     content = _content(path)
     tensors, card = _tensors(path, content), read_card(path)
     if hashlib.sha256(content).hexdigest() != card.sha256:
         raise RefusedError(f"{path}: the card belongs to another file: the digest differs")
     if card.env != plant.env_id:
-        raise WrongPlantError(f"{path.name} was trained for {card.env}, not for {plant.env_id}")
+        raise NotApplicableError(f"{path.name} was trained for {card.env}, not for {plant.env_id}")
     for name, here in names(plant).items():
         if getattr(card, name) != here:
-            raise WrongPlantError(f"{path.name} was trained with the {name} {getattr(card, name)}, not {here}")
+            raise NotApplicableError(f"{path.name} was trained with the {name} {getattr(card, name)}, not {here}")
     if dict(plant.options) not in card.options:
-        raise WrongPlantError(f"{path.name} was trained with the options {card.options}, not {dict(plant.options)}")
+        raise NotApplicableError(f"{path.name} was trained with the options {card.options}, not {dict(plant.options)}")
     return tensors, card
 
 
-def shape_of(path: Path, card: Card) -> tuple[Shape, int]:
+def find(method: str, plant: Plant, path: str = "") -> tuple[Path, dict[str, Array], Card]:
+    """The weights of a method for a plant: those at a path, or else those that ship.
+
+    Returns:
+        their file, their tensors and their card
+
+    Raises:
+        NotApplicableError: There are none for this plant and its options.
+        RefusedError: As `read`.
+    """
+    file = Path(path) if path else WEIGHTS / f"{method}-{plant.id}.safetensors"
+    if not file.exists():
+        raise NotApplicableError(f"no trained weights for {plant.id}; train them: fdi-gym train {method} {plant.id}")
+    return file, *read(file, plant)
+
+
+def model_of(tensors: Mapping[str, Array]) -> FeatureModel:
+    """The identified model among the tensors."""
+    return FeatureModel(*(tensors[f"model.{name}"] for name in FeatureModel._fields))
+
+
+def model_tensors(model: FeatureModel) -> dict[str, Array]:
+    """The identified model as tensors."""
+    return {f"model.{name}": value for name, value in model._asdict().items()}
+
+
+def shape_of(path: Path, card: Card) -> tuple[FeatureShape, int]:
     """The shape of the identified model and the width of the layers, as the card gives them.
 
     Raises:
         RefusedError: One is missing, or not a whole number above 0 and up to its upper end.
     """
     sizes: dict[str, int] = {}
-    for name in (*Shape._fields, "hidden"):
-        value = card.shape.get(name, Shape._field_defaults.get(name))
+    for name in (*FeatureShape._fields, "hidden"):
+        value = card.shape.get(name, FeatureShape._field_defaults.get(name))
         if type(value) is not int or not 1 <= value <= SIZES[name]:
             what = f"a whole number above 0, up to {SIZES[name]}"
             raise RefusedError(f"{path.with_suffix('.json')}: the shape's {name} is {what}, not {str(value)[:80]!r}")
         sizes[name] = value
     hidden = sizes.pop("hidden")
-    return Shape(**sizes), hidden
+    return FeatureShape(**sizes), hidden
 
 
-def fitted_of(path: Path, card: Card, process: str) -> Fitted:
+def calibration_of(path: Path, card: Card, process: str) -> ProbabilityCalibration:
     """The calibration for a process.
 
     Raises:
@@ -229,17 +254,6 @@ def fitted_of(path: Path, card: Card, process: str) -> Fitted:
     if found is None or not len(found.bias) == len(found.prior) == len(card.labels):
         raise RefusedError(f"{path.with_suffix('.json')} has no calibration of {len(card.labels)} labels for {process!r}")
     return found
-
-
-def width_of(path: Path, tensors: dict[str, Array], name: str) -> int:
-    """How many columns a weight matrix has.
-
-    Raises:
-        RefusedError: There is no such matrix.
-    """
-    if name not in tensors or tensors[name].ndim != 2:
-        raise RefusedError(f"{path} lacks the matrix {name}")
-    return tensors[name].shape[1]
 
 
 def check_tensors(path: Path, tensors: dict[str, Array], expected: dict[str, tuple[int, ...]]) -> None:

@@ -1,6 +1,6 @@
 """Writes leaderboards/learning/: the page that sets the learned diagnosers beside filters and oracle, and learning curves.
 
-python -m baselines.networks.report
+python benchmarks/learning_page.py
 
 Every figure is read from the rows of the leaderboards and from the cards of the weights.
 """
@@ -10,14 +10,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from baselines.networks import weights
-from baselines.networks.weights import Card
+from baselines.learned import weights
+from baselines.learned.weights import Card
 from fdi_gym.files import write_whole
 from fdi_gym.leaderboard import clairvoyant, markdown, read_rows
 from fdi_gym.row import Row
 from fdi_gym.suite import suite_names
 
-HOME = Path(__file__).parent.parent.parent / "leaderboards"
+HOME = Path(__file__).parent.parent / "leaderboards"
 LEARNED = ("sequence_net", "residual_net", "ppo", "ppo_identification")
 REFERENCE = ("bayes_bank", "switching_bayes_bank", "hypothesis_bank")  # this package's own Bayesian banks, of no paper
 FLOOR = ("null", "random")
@@ -143,7 +143,7 @@ def budget_table(cards: list[Card]) -> str:
          f"{card.seeds['training'][0]} to {card.seeds['training'][1]}", ", ".join(card.filters) or "-"]
         for card in cards
     ]  # fmt: skip
-    return markdown(["command", "samples", "minutes", "training seeds", "hears"], lines)
+    return markdown(["command", "samples", "minutes", "training seeds", "filters"], lines)
 
 
 def picture(card: Card, path: Path) -> None:

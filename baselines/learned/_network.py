@@ -1,4 +1,4 @@
-"""The network: gated products of its features, a gated recurrent unit over the blocks, and two heads."""
+"""The recurrent network as it is trained, and its loss; `sequence_net.forward` runs it step by step, without torch."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from baselines.learned.sequence_net import LOG_STD, REACH
+
 TRUST = 3.0  # in the filters' labels before training: a logit
-REACH = 10.0  # trust is learned so many times faster than the other weights: it must rise and fall by several logits
 
 
 class SequenceNetwork(nn.Module):
     """Logits of the labels, and mean and log standard deviation of the estimated deviation, causally.
+
+    Gated products of its features, a gated recurrent unit over the steps, and two heads.
 
     Chosen by measurement, in equal time on one core (leaderboards/learning/README.md): a gated recurrent unit, against a
     dilated convolution and diagonal state-space layers. Its state is one vector, so a stream costs one cell per block.
@@ -21,13 +24,14 @@ class SequenceNetwork(nn.Module):
         labels: Labels of the isolation task.
         estimated: Entries of the identification task.
         hidden: Width of every layer.
-        words: Entries of what each filter says, at the end of an input. They reach the logits directly, too: an untrained
-            network believes the labels that the filters declare, and training corrects that, for each process apart.
-        processes: Entries before these words that say which fault process to expect: 1 for one, 0 for the others.
+        filters: Entries of what each filter says, at the end of an input. They reach the logits directly, too: an
+            untrained network believes the labels that the filters declare, and training corrects that, for each process
+            apart.
+        processes: Entries before these that say which fault process to expect: 1 for one, 0 for the others.
     """
 
     def __init__(
-        self, features: int, labels: int, estimated: int, hidden: int, words: tuple[int, ...] = (), processes: int = 1
+        self, features: int, labels: int, estimated: int, hidden: int, filters: tuple[int, ...] = (), processes: int = 1
     ):  # fmt: skip
         super().__init__()
         self.labels, self.estimated, self.hidden = labels, estimated, hidden
@@ -36,10 +40,10 @@ class SequenceNetwork(nn.Module):
         self.memory = nn.GRU(hidden, hidden, batch_first=True)
         self.read = nn.Linear(hidden, hidden)
         self.heads = nn.Linear(hidden, labels + 2 * estimated)
-        self.words, self.processes = sum(words), processes
-        if words:
-            self.direct = nn.Linear(processes * self.words, labels, bias=False)
-            believe = [torch.eye(labels, width) * TRUST / REACH / len(words) for width in words]
+        self.told, self.processes = sum(filters), processes
+        if filters:
+            self.direct = nn.Linear(processes * self.told, labels, bias=False)
+            believe = [torch.eye(labels, width) * TRUST / REACH / len(filters) for width in filters]
             self.direct.weight.data = torch.cat(believe * processes, dim=1)
 
     def forward(self, x: Tensor, h: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -49,10 +53,10 @@ class SequenceNetwork(nn.Module):
         remembered, after = self.memory(seen, h)
         out = self.heads(F.silu(self.read(seen + remembered)))
         logits, mean, log_std = out.split([self.labels, self.estimated, self.estimated], dim=-1)
-        if self.words:
-            process, words = x[..., -self.words - self.processes : -self.words], x[..., -self.words :]
-            logits = logits + REACH * self.direct((process[..., None] * words[..., None, :]).flatten(-2))
-        return logits, mean, log_std.clamp(-6.0, 3.0), after
+        if self.told:
+            process, told = x[..., -self.told - self.processes : -self.told], x[..., -self.told :]
+            logits = logits + REACH * self.direct((process[..., None] * told[..., None, :]).flatten(-2))
+        return logits, mean, log_std.clamp(*LOG_STD), after
 
 
 def loss(

@@ -6,14 +6,16 @@ It sees what the environment would have shown it: scaled float32 samples, in blo
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import nn
 
 from fdi_gym.diagnosis import Diagnoser, Diagnosis
 from fdi_gym.plant import Array, Plant
+
+if TYPE_CHECKING:
+    from torch import nn
 
 
 def from_torch(
@@ -24,7 +26,7 @@ def from_torch(
     decision_period: int = 1,
     length: int | None = None,
     stride: int = 1,
-    dtype: torch.dtype = torch.float32,
+    dtype: Any = None,
 ) -> Diagnoser:
     """A diagnoser that shows windows to a module and holds its answer until the next decision.
 
@@ -37,11 +39,47 @@ def from_torch(
         decision_period: Samples per decision.
         length: Blocks in a window; None for no window.
         stride: Decisions between the blocks of a window.
-        dtype: Of what the module is shown.
+        dtype: Of what the module is shown; default torch.float32.
 
     Raises:
         ValueError: Unknown task.
     """
+    import torch
+
+    dtype = dtype or torch.float32
+    module = module.to(dtype).eval()
+    return _windowed(lambda window: module(torch.from_numpy(window).to(dtype)), plant, task, decision_period, length, stride)
+
+
+def from_sb3(
+    policy: Any, plant: Plant, *, task: str = "isolation", decision_period: int = 1, length: int | None = None,
+    stride: int = 1,
+) -> Diagnoser:  # fmt: skip
+    """A diagnoser from an SB3 actor-critic policy (`model.policy`) trained on scaled units: its best action.
+
+    Args:
+        policy: The policy.
+        plant, task, decision_period, length, stride: As in `from_torch`.
+
+    Raises:
+        ValueError: Unknown task.
+    """
+    import torch
+
+    policy = policy.cpu()
+
+    def answer(window: Array) -> Any:
+        found = policy.get_distribution(torch.from_numpy(window).float()).distribution
+        return found.logits if hasattr(found, "logits") else found.mean
+
+    return _windowed(answer, plant, task, decision_period, length, stride)
+
+
+def _windowed(
+    function: Callable[[Array], Any], plant: Plant, task: str, decision_period: int, length: int | None, stride: int
+) -> Diagnoser:  # fmt: skip
+    import torch
+
     if task not in ("isolation", "identification"):
         raise ValueError(f"unknown task {task!r}; there are isolation, identification")
     m, width = decision_period, len(plant.observed)
@@ -49,26 +87,29 @@ def from_torch(
     nominal, scale = (np.array([getattr(s, name) for s in plant.observed]) for name in ("nominal", "scale"))
     low, high = (np.array([getattr(s, name) for s in plant.estimated]) for name in ("low", "high"))
     healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
-    module = module.to(dtype).eval()
 
     def init(n: int) -> Any:
-        label, probs, theta = np.zeros(n, np.int64), np.tile(np.eye(len(plant.labels))[0], (n, 1)), np.tile(healthy, (n, 1))
+        label, probs, estimate = (
+            np.zeros(n, np.int64),
+            np.tile(np.eye(len(plant.labels))[0], (n, 1)),
+            np.tile(healthy, (n, 1)),
+        )
         isolates = task == "isolation"
-        said = Diagnosis(label > 0, label, None if isolates else theta, None, probs if isolates else None)
-        return 0, np.zeros(n, bool), np.zeros((n, m, width)), np.zeros((n, depth, m, width)), said
+        diagnosis = Diagnosis(label > 0, label, None if isolates else estimate, None, probs if isolates else None)
+        return 0, np.zeros(n, bool), np.zeros((n, m, width)), np.zeros((n, depth, m, width)), diagnosis
 
     def decide(window: Array) -> Diagnosis:
         with torch.inference_mode():
-            answer = module(torch.from_numpy(window).to(dtype)).double().numpy()
+            answer = function(window).double().numpy()
         if task == "identification":
-            theta = low + (high - low) * (np.clip(answer, -1, 1) + 1) / 2
-            return Diagnosis(np.zeros(len(theta), bool), np.zeros(len(theta), np.int64), theta)
+            estimate = low + (high - low) * (np.clip(answer, -1, 1) + 1) / 2
+            return Diagnosis(np.zeros(len(estimate), bool), np.zeros(len(estimate), np.int64), estimate)
         probs = np.exp(answer - answer.max(axis=1, keepdims=True))
-        mode = answer.argmax(axis=1)
-        return Diagnosis(mode > 0, mode, label_probs=probs / probs.sum(axis=1, keepdims=True))
+        label = answer.argmax(axis=1)
+        return Diagnosis(label > 0, label, label_probs=probs / probs.sum(axis=1, keepdims=True))
 
     def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
-        k, begun, block, past, said = state
+        k, begun, block, past, diagnosis = state
         newest = ((obs - nominal) / scale).astype(np.float32).astype(float)
         block = np.where(begun[:, None, None], np.concatenate([block[:, 1:], newest[:, None]], axis=1), newest[:, None])
         if k % m == 0:
@@ -76,25 +117,7 @@ def from_torch(
                 begun[:, None, None, None], np.concatenate([past[:, 1:], block[:, None]], axis=1), block[:, None]
             )
             window = past[:, ::stride] if length is not None else past[:, 0]
-            said = decide(window if m > 1 else window[..., 0, :])
-        return (k + 1, np.ones_like(begun), block, past, said), said
+            diagnosis = decide(window if m > 1 else window[..., 0, :])
+        return (k + 1, np.ones_like(begun), block, past, diagnosis), diagnosis
 
     return Diagnoser(init, update)
-
-
-class _Actor(nn.Module):
-    """What an SB3 actor-critic policy does when it is asked for its best action."""
-
-    def __init__(self, policy: Any):
-        super().__init__()
-        self.policy = policy
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        """Logits of a discrete action, or the mean of a continuous one."""
-        found = self.policy.get_distribution(observation).distribution
-        return found.logits if hasattr(found, "logits") else found.mean
-
-
-def from_sb3(policy: Any, plant: Plant, **arguments: Any) -> Diagnoser:
-    """A diagnoser from an SB3 actor-critic policy (`model.policy`) trained on scaled units; arguments as in `from_torch`."""
-    return from_torch(_Actor(policy.cpu()), plant, **arguments)

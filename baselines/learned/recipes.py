@@ -1,0 +1,164 @@
+"""How networks are trained: the recipes of the shipped weights, one per plant, and a general one for any other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from baselines.learned.features import FeatureShape
+from baselines.learned.flights import Condition
+from fdi_gym.plant import Plant
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """What all training has.
+
+    Args:
+        conditions: Fault processes, with the options of the plant.
+        shape: Of the identified model; a step of the network is `shape.period` samples.
+        identify: Flights per condition from which the model is identified, with their truth: the first training flights.
+        candidates: Seeds per training flight, from which those are taken that show rare labels.
+        hidden: Width of the layers.
+        rate: Learning rate at its height.
+        validate: Rounds (passes, legs) between validations.
+        validation: Flights per condition of the validation.
+    """
+
+    conditions: tuple[Condition, ...]
+    shape: FeatureShape
+    identify: int = 300
+    candidates: int = 1
+    hidden: int = 64
+    rate: float = 3e-3
+    validate: int = 8
+    validation: int = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceRecipe(Recipe):
+    """How a recurrent network is trained under supervision.
+
+    Args:
+        filters: Diagnosers that the network is shown; training then starts from the network that is shown none.
+        flights: Training flights per condition.
+        chunk: Flights per condition that are flown together ...
+        passes: ... and shown so many times.
+        batch: Flights per step of the optimiser.
+        decay: Weight decay.
+        share: Of the identification task in the loss.
+    """
+
+    filters: tuple[str, ...] = ()
+    flights: int = 2048
+    chunk: int = 64
+    passes: int = 4
+    batch: int = 32
+    decay: float = 1e-2
+    share: float = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyRecipe(Recipe):
+    """How a policy is trained by PPO; the conditions take turns.
+
+    Args:
+        task: "isolation" or "identification".
+        patience: Of the delay-aware reward, in decisions.
+        decisions: The budget.
+        envs: Environments side by side. Their flights begin together, so `steps` should span whole flights ...
+        steps: Decisions of each per update; ... but not their very end, where new flights would begin for nothing.
+        updates: Updates per leg.
+        epochs: Passes over an update's decisions.
+        batch: Decisions per gradient step.
+        entropy: Weight of the entropy.
+    """
+
+    hidden: int = 128
+    rate: float = 1e-3
+    validation: int = 60
+    task: str = "isolation"
+    patience: float = 10.0
+    decisions: int = 1_000_000
+    envs: int = 64
+    steps: int = 250
+    updates: int = 1
+    epochs: int = 4
+    batch: int = 512
+    entropy: float = 0.01
+
+
+BOTH = (Condition("standard", {}), Condition("hard", {}))
+SEQUENCES = {
+    "B747Lateral": SequenceRecipe(
+        conditions=BOTH, shape=FeatureShape(stride=4, lags=12, degree=1), flights=6144, validate=16
+    ),
+    "HUAVHover": SequenceRecipe(
+        conditions=(Condition("standard", {"kappa": 0.3}), Condition("hard", {"kappa": 1.0})),
+        shape=FeatureShape(stride=5, lags=6, degree=1), flights=10240, candidates=8, validate=16,
+    ),
+    "MissilePitch": SequenceRecipe(
+        conditions=BOTH, shape=FeatureShape(stride=2, lags=8, degree=3, effects=2, every=5),
+        identify=200, flights=6144, validate=16,
+    ),
+    "CMGSatellite": SequenceRecipe(
+        conditions=BOTH, shape=FeatureShape(stride=20, lags=2, degree=2, effects=2, every=2),
+        identify=100, flights=6144, chunk=64, passes=8, validation=60, validate=32,
+    ),
+}  # fmt: skip
+FILTERS = {  # that residual_net is shown, and training flights per condition: filters cost more than networks
+    "B747Lateral": (("bayes_bank", "switching_bayes_bank"), 600),
+    "HUAVHover": (("hypothesis_bank", "ascdkf"), 1000),
+    "MissilePitch": (("augmented_ekf_imm", "augmented_ekf_mode_probabilities"), 600),
+    "CMGSatellite": (("mekf",), 400),
+}
+GENERAL_FILTERS = (("augmented_ekf", "multiple_model_ekf"), 300)
+POLICIES = {  # steps: decisions of a flight, less one
+    "B747Lateral": {"steps": 299, "decisions": 600_000, "entropy": 0.003},
+    "HUAVHover": {"steps": 199, "decisions": 1_000_000},
+    "MissilePitch": {"steps": 199, "decisions": 800_000},
+    "CMGSatellite": {"steps": 249, "decisions": 600_000, "candidates": 4, "epochs": 6, "validate": 6},
+}
+
+
+def sequence_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
+    """A plant's recipe, or for one without: its standard and hard processes, or whichever it has beside the healthy one.
+
+    Args:
+        plant: The plant.
+        budget: Training flights per condition, in place of the recipe's.
+    """
+    found = SEQUENCES.get(plant.id)
+    if found is None:
+        names = [name for name in ("standard", "hard") if name in plant.processes]
+        names = names or [name for name in plant.processes if name != "fault-free"]
+        shape = FeatureShape(stride=5, lags=6, degree=2)
+        found = SequenceRecipe(conditions=tuple(Condition(name, {}) for name in names), shape=shape)
+    return found if budget is None else replace(found, flights=budget, chunk=min(found.chunk, budget))
+
+
+def residual_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
+    """The recipe of the network that is shown filters too; arguments as in `sequence_recipe`."""
+    filters, most = FILTERS.get(plant.id, GENERAL_FILTERS)
+    flights = most if budget is None else budget
+    chunk = min(most, flights)
+    return replace(
+        sequence_recipe(plant), filters=filters, identify=100, flights=flights, chunk=chunk, passes=20, validate=2, rate=1e-3
+    )
+
+
+def policy_recipe(plant: Plant, task: str, budget: int | None = None) -> PolicyRecipe:
+    """How a plant's policy is trained: under the conditions of its recurrent network, seeing the same features.
+
+    Args:
+        plant: The plant.
+        task: "isolation" or "identification".
+        budget: Decisions, in place of the recipe's.
+    """
+    like = sequence_recipe(plant)
+    found = PolicyRecipe(
+        **{"conditions": like.conditions, "shape": like.shape, "identify": like.identify, "candidates": like.candidates}
+        | POLICIES.get(plant.id, {})
+    )
+    if task == "identification":
+        found = replace(found, task=task, entropy=0.0, decisions=2_000_000)
+    return found if budget is None else replace(found, decisions=budget)
