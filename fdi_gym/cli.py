@@ -209,9 +209,9 @@ def train(
         output: Folder that gets a copy of weights and card.
     """
     from fdi_gym.diagnosis import train as run
+    from fdi_gym.discovery import load_plant
     from fdi_gym.files import write_whole
     from fdi_gym.listing import find_plant
-    from fdi_gym.discovery import load_plant
 
     path = run(method, load_plant(find_plant(plant)[1]), budget=budget, seed=seed, work=work, threads=threads)
     for suffix in (".safetensors", ".json"):

@@ -22,15 +22,18 @@ class FDIEnv(Specified, gym.Env):
     knows. The bounds are the sensors' and commands' ranges. With `decision_period` m > 1 it is the block of the last m
     samples, shape (m, n), oldest first; sample 0 stands in for those before it.
 
-    Action space: for `task="isolation"` `Discrete(number of labels)`, the label of the fault that acted over
-    [k - 1, k); for `task="identification"` a `Box` over the estimated quantity in physical units (finite values outside
-    it are clipped).
+    Action space, by `task` (see `fdi_gym.tasks`; finite values outside a `Box` are clipped):
+        "isolation": `Discrete(number of labels)`, the label of the fault that acted over [k - 1, k).
+        "identification": `Box` over the estimated quantity.
+        "diagnosis": `Box` of a score for each label, the largest of which is meant, and then the estimated quantity.
+        "scenario": `Box` of (present, onset, end, size) for each fault mode: the declaration of the whole flight.
 
     Names, units, bounds and labels of a plant are in the docstring of its file, in `fdi-gym list PLANT`, and in
     `env.unwrapped.plant`.
 
-    Reward: as the plant declares. The action after sample 0 is worth 0, since no interval has ended. With m > 1 an
-    action is judged at the newest sample of its block.
+    Reward: as the plant declares; for "diagnosis" the sum of both. The action after sample 0 is worth 0, since no interval
+    has ended. With m > 1 an action is judged at the newest sample of its block. For "scenario" only the last action of the
+    episode counts, and is worth 0 to 1 (`fdi_gym.declaration.worth`).
 
     Episode: the plant flies whatever is diagnosed. It is `truncated` at the scenario's last sample and `terminated`
     where the plant leaves its declared envelope.
@@ -42,7 +45,7 @@ class FDIEnv(Specified, gym.Env):
 
     Args:
         plant: Plant id (set by the registration).
-        task: "isolation" or "identification".
+        task: "isolation", "identification", "diagnosis" or "scenario".
         process: Name of one of the plant's fault processes. Default: "standard".
         scenario: A `FaultScenario`, or its JSON text, that every episode replays exactly, noise included.
         mismatch: Level of the difference between the truth's physical parameters and the diagnosers' model, in the
@@ -81,7 +84,6 @@ class FDIEnv(Specified, gym.Env):
         self.render_mode = render_mode
         self.scenario: FaultScenario | None = None
         self._flights: Flights | None = None
-        self._rewards: list[list[float]] = np.asarray(self.plant.isolation_reward, float).tolist()
         self._k, self._over = 0, True
         self._declared: list[tuple[int, Any]] = []
         self._record: Record | None = None
@@ -143,18 +145,17 @@ class FDIEnv(Specified, gym.Env):
             raise RuntimeError("the episode is over, or has not begun: call reset()")
         k, rules = self._k, self._rules
         now = k - self._base
-        if rules.task == "isolation":
-            checked: Any = rules.check_label(action)
-            reward = self._rewards[self._label[now]][checked] if k else 0.0
-        else:
-            checked = rules.check(action, ())
-            reward = float(rules.reward(checked, self._label[now], self._target[now])) if k else 0.0
+        checked = rules.task.check(action, ())
+        reward = float(rules.task.reward(checked, self._label[now], self._target[now])) if k else 0.0
         if self.render_mode is not None:
             self._declared.append((k, checked))
         while self._flown <= k + rules.period and self._flown <= self._length:
             self._fly()
         self._k = k = min(k + rules.period, self._length)
         self._over = k == self._length
+        if self._over and rules.task.at_end:
+            assert self.scenario is not None
+            reward = float(rules.final(checked[None], [self.scenario])[0])
         if self.render_mode == "human":
             self.render()
         terminated = self._over and self._terminated
@@ -183,7 +184,7 @@ class FDIEnv(Specified, gym.Env):
         from fdi_gym.plots import Canvas
 
         if self._canvas is None:
-            self._canvas = Canvas(self.plant, self._rules.task, window=self.render_mode == "human")
+            self._canvas = Canvas(self.plant, self._rules.task.name, window=self.render_mode == "human")
         if self._record is None:
             self._record = simulate(self.plant, [self.scenario])
         return self._canvas.draw(self._record, self._k, self._declared)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from fdi_gym.declaration import END, ONSET, PRESENT, true_declaration
 from fdi_gym.engine import Record
 from fdi_gym.plant import Array, Plant
 
@@ -14,12 +15,13 @@ INK, TRUTH, SAID, SHADE = "#333333", "#1b6ca8", "#d1495b", "#f3dcd4"
 
 
 class Canvas:
-    """One figure, drawn again as the flight goes on: what the sensors say, the true label and the declared one, and in
-    the identification task the estimated entries beside the truth.
+    """One figure, drawn again as the flight goes on: what the sensors say, and truth and diagnosis beside each other.
+
+    Of the label, the estimated entries, both, or, for a declared scenario, the windows in which each mode acted.
 
     Args:
         plant: The plant.
-        task: "isolation" or "identification".
+        task: Name of the task.
         window: Show a window that follows along; else pictures only.
     """
 
@@ -27,7 +29,8 @@ class Canvas:
         from matplotlib.figure import Figure
 
         self.plant, self.task = plant, task
-        rows = 2 if task == "isolation" else 1 + min(len(plant.estimated), 4)
+        entries = min(len(plant.estimated), 4 if task == "identification" else 3)
+        rows = 1 + {"isolation": 1, "identification": entries, "diagnosis": 1 + entries, "scenario": 1}[task]
         size = (9.6, 6.4)
         if window:
             import matplotlib.pyplot as plt
@@ -49,7 +52,7 @@ class Canvas:
         Args:
             record: One flight (its first one is drawn).
             k: The current sample.
-            declared: (sample, action) pairs so far; actions are labels or estimates in physical units.
+            declared: (sample, answer) pairs so far, as the task's `check` gives them.
 
         Returns:
             The picture, (H, W, 3) uint8, or None for a window.
@@ -67,19 +70,17 @@ class Canvas:
         top.legend(loc="upper left", ncol=6, fontsize=7, frameon=False)
         top.set_ylabel("sensors, scaled")
         top.set_title(f"{plant.env_id}   t = {k * plant.dt:.1f} s   shaded: a fault acts", loc="left", fontsize=9)
-        if self.task == "isolation":
-            axis = self.axes[1]
-            axis.step(t, label, where="post", color=TRUTH, lw=1.8, label="truth")
-            axis.plot(said_t, [int(a) for _, a in declared], ".", ms=2.5, color=SAID, label="diagnosis")
-            axis.set_ylim(-0.5, len(plant.labels) - 0.5)
-            axis.set_yticks(range(len(plant.labels)), [entry.name for entry in plant.labels], fontsize=7)
-            axis.legend(loc="upper left", fontsize=7, frameon=False)
-        else:
-            for j, axis in enumerate(self.axes[1:]):
+        if self.task in ("isolation", "diagnosis"):
+            self._draw_labels(t, label, said_t, [int(a if self.task == "isolation" else a[0]) for _, a in declared])
+        if self.task in ("identification", "diagnosis"):
+            at = int(self.task == "diagnosis")
+            for j, axis in enumerate(self.axes[1 + at :]):
                 axis.plot(t, record.target[0, : k + 1, j], color=TRUTH, lw=1.8, label="truth")
-                axis.plot(said_t, [a[j] for _, a in declared], color=SAID, lw=0.9, label="diagnosis")
+                axis.plot(said_t, [a[at + j] for _, a in declared], color=SAID, lw=0.9, label="diagnosis")
                 axis.set_ylabel(f"{plant.estimated[j].name}\n{plant.estimated[j].unit}", fontsize=7)
-            self.axes[1].legend(loc="upper left", fontsize=7, frameon=False, ncol=2)
+            self.axes[-1].legend(loc="upper left", fontsize=7, frameon=False, ncol=2)
+        if self.task == "scenario":
+            self._draw_windows(record, k, declared[-1][1] if declared else None)
         self.axes[-1].set_xlabel("time, s")
         self.axes[-1].set_xlim(0, max(k, 1) * plant.dt)
         if self._show is not None:
@@ -89,6 +90,28 @@ class Canvas:
         self.figure.tight_layout()
         self.figure.canvas.draw()
         return np.asarray(self.figure.canvas.buffer_rgba())[..., :3].copy()
+
+    def _draw_labels(self, t: Array, label: Array, said_t: Array, said: Sequence[int]) -> None:
+        axis = self.axes[1]
+        axis.step(t, label, where="post", color=TRUTH, lw=1.8, label="truth")
+        axis.plot(said_t, said, ".", ms=2.5, color=SAID, label="diagnosis")
+        axis.set_ylim(-0.5, len(self.plant.labels) - 0.5)
+        axis.set_yticks(range(len(self.plant.labels)), [entry.name for entry in self.plant.labels], fontsize=7)
+        axis.legend(loc="upper left", fontsize=7, frameon=False)
+
+    def _draw_windows(self, record: Record, k: int, said: Array | None) -> None:
+        """The windows of each mode: the true one up to sample k, and the one declared last, as shares of the flight."""
+        axis, length, dt = self.axes[1], int(record.length[0]), self.plant.dt
+        truth = true_declaration(self.plant, record)[0]
+        for i, row in enumerate(truth):
+            if row[PRESENT] and row[ONSET] < k:
+                axis.barh(i + 0.15, (min(row[END], k) - row[ONSET]) * dt, 0.3, row[ONSET] * dt, color=TRUTH)
+            if said is not None and said[i, PRESENT] >= 0.5:
+                axis.barh(
+                    i - 0.15, (said[i, END] - said[i, ONSET]) * length * dt, 0.3, said[i, ONSET] * length * dt, color=SAID
+                )
+        axis.set_ylim(-0.5, len(truth) - 0.5)
+        axis.set_yticks(range(len(truth)), [mode.name for mode in self.plant.modes], fontsize=7)
 
     def close(self) -> None:
         """Close the window, if there is one."""

@@ -13,13 +13,15 @@ from typing import Any
 
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.spaces import Box, Discrete, Space
+from gymnasium.spaces import Box
 
+from fdi_gym.declaration import true_declaration
 from fdi_gym.discovery import load_plant
+from fdi_gym.engine import simulate
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.plant import Array, Plant, Signal
+from fdi_gym.tasks import TASKS
 
-TASKS = ("isolation", "identification")
 UNITS = ("physical", "scaled")
 
 # Samples that are flown ahead of the agent: few after a reset, since an episode may be short, and twice as many each time.
@@ -114,12 +116,6 @@ def _column(signals: tuple[Signal, ...], field: str) -> Array:
     return np.array([getattr(s, field) for s in signals], float)
 
 
-def _holds_bool(action: Any) -> bool:
-    if isinstance(action, (list, tuple)):
-        return any(_holds_bool(entry) for entry in action)
-    return isinstance(action, (bool, np.bool_))
-
-
 class Rules:
     """The rules of one environment; arguments as in `FDIEnv`."""
 
@@ -136,7 +132,8 @@ class Rules:
         if isinstance(plant, Plant) and options:
             raise ValueError(f"{plant.id} is built already: the options {', '.join(options)} come too late")
         self.plant = load_plant(plant, **options) if isinstance(plant, str) else plant
-        self.task, self.mismatch = task, self._checked_mismatch(mismatch)
+        self.mismatch = self._checked_mismatch(mismatch)
+        self.task = TASKS[task](self.plant, units == "scaled")
         if scenario is not None and (process is not None or mismatch is not None):
             raise ValueError("a scenario is replayed as it is: neither a process nor a mismatch goes with it")
         self.scenario = None if scenario is None else self.checked_scenario(scenario, "scenario")
@@ -145,9 +142,8 @@ class Rules:
         self._declare_spaces(units)
 
     def _declare_spaces(self, units: str) -> None:
-        seen, asked = self.plant.observed, self.plant.estimated
+        seen = self.plant.observed
         low, high = _column(seen, "low"), _column(seen, "high")
-        self.low, self.high = _column(asked, "low"), _column(asked, "high")
         self.scaled = units == "scaled"
         self._nominal, self._scale = _column(seen, "nominal"), _column(seen, "scale")
         dtype = np.float32 if self.scaled else np.float64
@@ -157,12 +153,7 @@ class Rules:
         if self.period > 1:
             low, high = np.tile(low, (self.period, 1)), np.tile(high, (self.period, 1))
         self.observation_space = Box(low, high, dtype=dtype)
-        if self.task == "isolation":
-            self.action_space: Space = Discrete(len(self.plant.labels))
-        elif self.scaled:
-            self.action_space = Box(-1.0, 1.0, (len(asked),), dtype=np.float32)
-        else:
-            self.action_space = Box(self.low, self.high, dtype=np.float64)
+        self.action_space = self.task.space
 
     def _checked_mismatch(self, mismatch: Any) -> float | None:
         if mismatch is None:
@@ -211,47 +202,13 @@ class Rules:
         """An observation in the units that were asked for; always a new array."""
         return ((obs - self._nominal) / self._scale).astype(np.float32) if self.scaled else obs.copy()
 
-    def check_label(self, action: Any) -> int:
-        """A single label, checked as `check` does, quickly."""
-        if type(action) is int and 0 <= action < len(self.plant.labels):
-            return action
-        return int(self.check(action, ()))
+    def final(self, answers: Array, scenarios: Sequence[FaultScenario]) -> Array:
+        """What the last answers (n, ...) of episodes are worth in a task that is judged at their end.
 
-    def check(self, action: Any, shape: tuple[int, ...]) -> Array:
-        """The action as an array.
-
-        Raises:
-            ValueError: Wrong shape, not finite, or not a label; the message says what is allowed.
+        The flights are flown again for the truth of the whole of each.
         """
-        isolation = self.task == "isolation"
-        shape = shape if isolation else (*shape, len(self.low))
-        wanted = f"a label in 0..{len(self.plant.labels) - 1}, shape {shape} and integer" if isolation else \
-            f"finite and has the shape {shape}"  # fmt: skip
-        try:
-            value = np.asarray(action)
-        except Exception:  # an object may refuse in its own way
-            value = np.empty(())
-        kinds = "iu" if isolation else "iuf"
-        good = value.shape == shape and value.dtype.kind in kinds and not _holds_bool(action)
-        if good and isolation:
-            good = not ((value < 0).any() or (value >= len(self.plant.labels)).any())
-        elif good:
-            with np.errstate(over="ignore"):
-                value = value.astype(np.float64)
-            good = bool(np.isfinite(value).all())
-        if not good:
-            raise ValueError(f"the action is {wanted}, not {action!r}")
-        if isolation:
-            return value
-        if self.scaled:
-            value = self.low + (self.high - self.low) * (value + 1) / 2
-        return np.clip(value, self.low, self.high)
-
-    def reward(self, action: Array, label: Any, target: Array) -> Any:
-        """What a checked action is worth where the truth is label (...) and target (..., n)."""
-        if self.task == "isolation":
-            return self.plant.isolation_reward[label, action]  # type: ignore[index]
-        return self.plant.identification_reward(action - target)  # type: ignore[misc]
+        record = simulate(self.plant, scenarios)
+        return self.task.worth(answers, true_declaration(self.plant, record), record.length)
 
     def time(self, k: Any) -> Any:
         """The time of sample k [s]."""

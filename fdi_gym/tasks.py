@@ -119,8 +119,10 @@ class Isolation(Task):
     def __init__(self, plant: Plant, scaled: bool):
         super().__init__(plant, scaled)
         self.space = Discrete(len(plant.labels))
+        self._rewards: list[list[float]] = np.asarray(plant.isolation_reward, float).tolist()
 
     def check(self, action: Any, shape: tuple[int, ...]) -> Array:
+        """As `Task.check`."""
         if type(action) is int and not shape and 0 <= action < len(self.plant.labels):
             return action  # type: ignore[return-value]
         value, labels = _array(action), len(self.plant.labels)
@@ -130,6 +132,9 @@ class Isolation(Task):
         return value
 
     def reward(self, answer: Array, label: Any, target: Array) -> Any:
+        """As `Task.reward`."""
+        if type(label) is int:
+            return self._rewards[label][answer]  # type: ignore[index]
         return self.plant.isolation_reward[label, answer]  # type: ignore[index]
 
 
@@ -143,9 +148,11 @@ class Identification(_Boxed):
         self._bounded(*np.array([(s.low, s.high) for s in plant.estimated], float).T)
 
     def check(self, action: Any, shape: tuple[int, ...]) -> Array:
+        """As `Task.check`."""
         return self._physical(action, shape)
 
     def reward(self, answer: Array, label: Any, target: Array) -> Any:
+        """As `Task.reward`."""
         return self.plant.identification_reward(answer - target)  # type: ignore[misc]
 
 
@@ -164,10 +171,12 @@ class Diagnosis(_Boxed):
         self._bounded(np.r_[np.zeros(labels), low], np.r_[np.ones(labels), high])
 
     def check(self, action: Any, shape: tuple[int, ...]) -> Array:
+        """As `Task.check`."""
         value, labels = self._physical(action, shape), len(self.plant.labels)
         return np.concatenate([value[..., :labels].argmax(axis=-1)[..., None], value[..., labels:]], axis=-1)
 
     def reward(self, answer: Array, label: Any, target: Array) -> Any:
+        """As `Task.reward`."""
         said = answer[..., 0].astype(np.int64)
         of_label = self.plant.isolation_reward[label, said]  # type: ignore[index]
         return of_label + self.plant.identification_reward(answer[..., 1:] - target)  # type: ignore[misc]
@@ -191,9 +200,11 @@ class Scenario(_Boxed):
         self._bounded(low.ravel(), high.ravel())
 
     def check(self, action: Any, shape: tuple[int, ...]) -> Array:
+        """As `Task.check`."""
         return self._physical(action, shape).reshape(*shape, len(self.plant.modes), COLUMNS)
 
     def worth(self, answer: Array, truth: Array, length: Array) -> Array:
+        """As `Task.worth`."""
         declared = answer.copy()
         declared[..., ONSET : END + 1] *= np.asarray(length)[..., None, None]
         return worth(self.plant, truth, declared)

@@ -175,13 +175,14 @@ class FDIVectorEnv(Specified, VectorEnv):
         flights = self._flights
         if flights is None:
             raise RuntimeError("no episode has begun: call reset()")
-        checked = self._rules.check(actions, (self.num_envs,))
+        task = self._rules.task
+        checked = task.check(actions, (self.num_envs,))
         over = self._over
         begin = np.flatnonzero(over)
         if begin.size and self._mode is AutoresetMode.DISABLED:
             raise RuntimeError(f"episodes {begin.tolist()} are over: reset them with options={{'reset_mask': ...}}")
         k = self._k
-        reward = np.asarray(self._rules.reward(checked, self._here(self._buffer.label), self._here(self._target)), float)
+        reward = np.asarray(task.reward(checked, self._here(self._buffer.label), self._here(self._target)), float)
         reward = np.where((k == 0) | over, 0.0, reward)
         if self.render_mode is not None:
             for i in np.flatnonzero(~over):
@@ -193,6 +194,9 @@ class FDIVectorEnv(Specified, VectorEnv):
         self._row = self._now + self._k - k
         self._now += period
         ended = (self._k == flights.length) & ~over
+        if task.at_end and ended.any():
+            flown = [s for s, last in zip(self.scenarios, ended, strict=True) if last and s is not None]
+            reward[ended] = self._rules.final(checked[ended], flown)
         terminated = ended & flights.terminated
         truncated = ended & ~terminated
         self._over = ended
@@ -272,7 +276,7 @@ class FDIVectorEnv(Specified, VectorEnv):
         from fdi_gym.plots import Canvas
 
         if self._canvas is None:
-            self._canvas = Canvas(self.plant, self._rules.task)
+            self._canvas = Canvas(self.plant, self._rules.task.name)
         for i, scenario in enumerate(self.scenarios):
             if i not in self._records and scenario is not None:
                 self._records[i] = simulate(self.plant, [scenario])

@@ -14,7 +14,14 @@ from fdi_gym.envs import FDIEnv
 from fdi_gym.faults import draw
 from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env
 
-TASKS = [{}, {"task": "identification"}, {"decision_period": 7}, {"task": "identification", "units": "scaled"}]
+TASKS = [
+    {},
+    {"task": "identification"},
+    {"decision_period": 7},
+    {"task": "identification", "units": "scaled"},
+    {"task": "diagnosis", "units": "scaled"},
+    {"task": "scenario"},
+]
 
 
 def test_plant(plant):
@@ -34,7 +41,9 @@ def test_vector_env_under_mismatch(plant):
 
 
 @pytest.mark.parametrize(
-    "arguments", [{}, {"task": "identification", "units": "scaled"}], ids=["isolation", "identification"]
+    "arguments",
+    [{}, *({"task": task, "units": "scaled"} for task in ("identification", "diagnosis", "scenario"))],
+    ids=["isolation", "identification", "diagnosis", "scenario"],
 )
 def test_env_checkers_are_silent(plant, arguments):
     with warnings.catch_warnings():

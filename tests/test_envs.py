@@ -18,6 +18,7 @@ from fdi_gym.envs import FDIEnv
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.plants import b747_lateral as b747
 from fdi_gym.rules import CHUNK
+from fdi_gym.tasks import TASKS
 from fdi_gym.vector_envs import FDIVectorEnv
 
 
@@ -122,7 +123,7 @@ def test_mismatch_changes_the_truth_and_not_the_model():
 
 
 BAD = [
-    ({"task": "prediction"}, "isolation, identification"),
+    ({"task": "prediction"}, "isolation, identification, diagnosis, scenario"),
     ({"process": "easy"}, "standard"),
     ({"units": "furlongs"}, "physical, scaled"),
     ({"decision_period": 0}, "at least 1"),
@@ -208,7 +209,7 @@ def test_episodes_of_the_process_differ_and_repeat():
     assert not np.array_equal(first[1], first[2])
 
 
-@pytest.mark.parametrize("task", ["isolation", "identification"])
+@pytest.mark.parametrize("task", list(TASKS))
 def test_pictures(plant, task):
     env = FDIEnv(plant.id, task=task, render_mode="rgb_array")
     env.reset(seed=1)

@@ -33,8 +33,8 @@ from fdi_gym.diagnosis import (
     trainer,
     trainers,
 )
-from fdi_gym.listing import details
 from fdi_gym.discovery import load_plant
+from fdi_gym.listing import details
 from fdi_gym.suite import load_suite, suite_names
 from fdi_gym.testing import check_diagnoser
 

@@ -10,10 +10,10 @@ import numpy as np
 from baselines.learned import features as feat
 from baselines.learned.features import FeatureModel, FeatureShape
 from fdi_gym.diagnosis import Diagnosis, make_diagnoser, run
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import Record, simulate
 from fdi_gym.faults import draw
 from fdi_gym.metrics import balanced_accuracy, scored_samples
-from fdi_gym.discovery import load_plant
 from fdi_gym.plant import Array, Plant
 
 # the first seed of each split, which ends where the next begins

@@ -11,10 +11,10 @@ from benchmarks.reproduction.comparison import first, rms
 from benchmarks.reproduction.numbered import fly
 from benchmarks.reproduction.pieces import Jobs, reference
 from fdi_gym.diagnosis import Decisions, make_diagnoser, run
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import Record
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.metrics import scored_samples
-from fdi_gym.discovery import load_plant
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants import b747_lateral as b747
 

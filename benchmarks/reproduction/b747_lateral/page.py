@@ -12,8 +12,8 @@ from benchmarks.reproduction.b747_lateral.measure import DETECTORS, GROUPS, PAPE
 from benchmarks.reproduction.comparison import Comparisons, binomial_error, shown
 from benchmarks.reproduction.numbered import fly
 from fdi_gym.diagnosis import make_diagnoser, run
-from fdi_gym.leaderboard import markdown
 from fdi_gym.discovery import load_plant
+from fdi_gym.leaderboard import markdown
 from fdi_gym.plants import b747_lateral as b747
 from fdi_gym.plots import flight
 

@@ -13,9 +13,9 @@ import numpy as np
 from benchmarks.reproduction.cmg_satellite.outcomes import Said, hard_outcome, time_line_outcome, window_outcome
 from benchmarks.reproduction.numbered import fly
 from fdi_gym.diagnosis import make_diagnoser, run
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import Record
 from fdi_gym.faults import FaultScenario
-from fdi_gym.discovery import load_plant
 from fdi_gym.plant import Plant
 from fdi_gym.plants import cmg_satellite as cmg
 

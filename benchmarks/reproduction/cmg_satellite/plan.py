@@ -12,9 +12,9 @@ from benchmarks.reproduction.cmg_satellite.blocks import SIGMA_R, Block, block_p
 from benchmarks.reproduction.cmg_satellite.outcomes import time_line_outcome
 from benchmarks.reproduction.numbered import fly
 from benchmarks.reproduction.pieces import Jobs, reference
+from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate, white_noise
 from fdi_gym.faults import FaultScenario
-from fdi_gym.discovery import load_plant
 from fdi_gym.plants import cmg_satellite as cmg
 
 REFERENCE = reference("cmg_satellite")

@@ -11,10 +11,10 @@ from benchmarks.reproduction.comparison import first, rms
 from benchmarks.reproduction.numbered import fly
 from benchmarks.reproduction.pieces import Jobs, reference
 from fdi_gym.diagnosis import Diagnoser, make_diagnoser, run
+from fdi_gym.discovery import load_plant
 from fdi_gym.estimation.belief import fault_inputs
 from fdi_gym.estimation.labels import channel_sets
 from fdi_gym.faults import FaultScenario
-from fdi_gym.discovery import load_plant
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.huav_hover import (
     CHANNELS,
