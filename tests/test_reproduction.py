@@ -8,6 +8,7 @@ import pytest
 from conftest import PLANTS, ROOT
 
 from benchmarks.reproduction.comparison import Comparisons
+from benchmarks.reproduction.missile_pitch.measure import numbered, unclipped
 from benchmarks.reproduction.pieces import finished, pieces, reference
 from fdi_gym.files import read_json
 
@@ -111,3 +112,14 @@ def test_the_helicopters_scenarios_are_met_to_the_last_digit():
         t.cell(r["accuracy"], found["accuracy"])
     assert len(rows) == 3
     assert t.agree == t.total
+
+
+@pytest.mark.parametrize("variant", reference("missile_pitch")["variant"], ids=lambda r: f"{r['noise']}-{r['size']}")
+def test_the_missiles_numbered_episodes_fly_at_every_scale(variant):
+    """Also where a scaled size leaves the range that the plant declares for its own processes."""
+    plant, scenarios, noise = numbered(range(20_000, 20_040), variant["noise"], variant["size"])
+    for scenario in scenarios:
+        unclipped(plant).validate(scenario)
+    sizes = [effect.value for s in scenarios for f in s.faults for effect in f.effects if effect.entry == "theta_jetloss"]
+    assert (max(sizes) > 1) == (variant["size"] > 1)
+    assert len(noise) == len(scenarios)
