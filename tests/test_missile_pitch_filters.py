@@ -18,9 +18,9 @@ from baselines.oracles import innovation_oracle as oracle
 from fdi_gym.diagnosis import NotApplicableError, diagnoser_of, find_diagnoser, make_diagnoser, run
 from fdi_gym.engine import simulate
 from fdi_gym.estimation import mixing
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.calibration import Persistence
 from fdi_gym.estimation.decision import Reading
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import load_plant
 from fdi_gym.plants import missile_pitch as missile

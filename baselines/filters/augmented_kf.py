@@ -13,8 +13,8 @@ import numpy as np
 
 from baselines.filters.two_stage_kf import aging, decision_rule, initial_covariances
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval, plus_held_commands
 from fdi_gym.estimation.decision import Reading
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T, symmetric, times, update
 from fdi_gym.estimation.linear import linear_model
 from fdi_gym.plant import Array, Plant
@@ -53,7 +53,7 @@ def augmented_filter(plant: Plant, aged: Callable[[Array], Array]) -> Filter:
         F[:, :n_x, :n_x], F[:, :n_x, n_x:] = model.A, model.E(at.u)
         X = times(F, s.X)
         X[:, :n_x] += times(model.B, at.u)
-        P = plus_held_commands(plant, F @ s.P @ T(F) + Q, s.X[:, :n_x], at)
+        P = F @ s.P @ T(F) + at.noise(Q)
         Pz = s.P[:, n_x:, n_x:]
         P[:, n_x:, n_x:] += aged(Pz) - Pz
         return s._replace(X=X, P=symmetric(P))

@@ -21,8 +21,8 @@ from scipy.special import log_ndtr, logsumexp
 from baselines.filters import kalman_filter
 from baselines.filters.kalman_filter import Healthy, sense
 from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading, Rule, by_candidate
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.plant import Array, Plant
 
 # (label, type, prior weight): per surface LOE 0.25, random position 0.15, jam 0.10

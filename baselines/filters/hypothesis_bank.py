@@ -16,9 +16,9 @@ import scipy.linalg
 from baselines.filters.unknown_inputs import initial_covariance, of_all_channels
 from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser, diagnoser_of
 from fdi_gym.estimation import mixing
-from fdi_gym.estimation.augmented import Interval, held_command_covariance
 from fdi_gym.estimation.belief import fault_inputs, noisy_sensors
 from fdi_gym.estimation.decision import Reading, by_candidate
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T, correct, log_likelihood, times
 from fdi_gym.estimation.labels import channel_sets
 from fdi_gym.estimation.linear import linear_output
@@ -130,11 +130,7 @@ def hypothesis_bank(
         Phi = np.tile(np.eye(N), (len(c), 1, 1, 1))
         Phi[:, 0, x] = T((F[:, L : L + N] - F[:, L + N :]) / (2 * width[:, None]))
         X[..., x] = F[:, :L]
-        P = Phi @ P @ T(Phi) + Q
-        more = held_command_covariance(plant, centre[:, x], at)
-        if more is not None:
-            P[..., x, x] += more[:, None]
-        return Hypotheses(X, P, s.mu, c)
+        return Hypotheses(X, Phi @ P @ T(Phi) + at.noise(Q, X[..., 0].size).reshape(-1, L, N, N), s.mu, c)
 
     def update(s: Hypotheses, at: Interval, y: Array, seen: Array) -> Hypotheses:
         n, m = len(y), len(sensors)

@@ -19,8 +19,8 @@ from baselines.filters.attitude import cross, require_attitude, rotated, taken, 
 from baselines.filters.effectiveness import F_MAX, F_MIN, P_THETA, Q_THETA, THRESHOLD, threshold_rule
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.estimation import kalman
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T, quadratic, times
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.cmg_satellite import DT, H0, JS, SIGMA_Q, cluster, inertia

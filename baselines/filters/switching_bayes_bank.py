@@ -19,8 +19,8 @@ from baselines.filters.bayes_bank import LOG_WEIGHT, Sizes, check, label_probabi
 from baselines.filters.kalman_filter import Healthy, sense
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.diagnosis.contract import map_arrays
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.plant import Array, Plant
 
 START, GRID = 200, 10  # first sample and period of the bookkeeping

@@ -15,8 +15,8 @@ from baselines.filters import kalman_filter
 from baselines.filters.bayes_bank import LOG_WEIGHT, Sizes, check, label_probabilities, marginals, most_probable
 from baselines.filters.kalman_filter import Healthy, sense
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant
 

@@ -18,9 +18,9 @@ import scipy.linalg
 from baselines.filters.propagation import trim_model
 from baselines.filters.unknown_inputs import of_all_channels
 from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.belief import FaultInputs, fault_inputs
 from fdi_gym.estimation.decision import Reading, Rule, Verdict
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T, masked, right_divide, symmetric, times
 from fdi_gym.estimation.labels import channel_sets, label_of_channels
 from fdi_gym.estimation.linear import linear_output
