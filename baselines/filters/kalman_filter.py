@@ -57,7 +57,7 @@ def start(f: Nominal, plant: Plant, n: int) -> Healthy:
     )  # fmt: skip
 
 
-def predict(f: Nominal, plant: Plant, s: Healthy, at: Interval) -> Healthy:
+def predict(f: Nominal, s: Healthy, at: Interval) -> Healthy:
     """Over an interval."""
     A = f.model.A
     return s._replace(x=times(A, s.x) + times(f.model.B, at.u), P=A @ s.P @ A.T + at.noise(f.Q))

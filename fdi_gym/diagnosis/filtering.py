@@ -3,8 +3,9 @@
 A filter says what it starts from, how it predicts over an interval from the model alone, how it uses the sensors that
 reported, and what it then knows. Counters, gaps, the first sample and the decision are not its business: a sensor that did
 not report arrives as 0 with `seen` False, a command or a known signal that is missing is held, and each episode has its own
-sample number. Of measurements that mean the same (a quaternion and its negative, an angle a turn later) it gets the one
-nearest what it expects.
+sample number. What a held command does to the state is part of the interval's process noise (`Interval.noise`). Of
+measurements that mean the same (a quaternion and its negative, an angle a turn later) it gets the one nearest what it
+expects.
 """
 
 from __future__ import annotations
