@@ -29,7 +29,7 @@ def my_filter(plant: Plant, belief: Belief, calibration: Calibration) -> Diagnos
         F[:, :n_x, :n_x], F[:, :n_x, n_x:] = model.A, model.E(at.u)
         X, P = times(F, s[0]), F @ s[1] @ T(F)
         X[:, :n_x] += times(model.B, at.u)
-        P[:, :n_x, :n_x] += belief.Q
+        P[:, :n_x, :n_x] += at.noise(belief.Q)
         P[:, n_x:, n_x:] += np.diag(belief.z_walk**2)
         return X, P
 

@@ -201,11 +201,14 @@ def compiled(signature: Any) -> Callable[[Any], Any]:
     """Make a generic kernel: compiled for this signature at its first call, cached; it runs without the GIL."""
 
     def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher = _lazily(function, signature)
+        dispatcher, loaded = _lazily(function, signature), None
 
         @functools.wraps(function)
         def call(*arguments: Any) -> Any:
-            return _load(dispatcher)(*arguments)
+            nonlocal loaded
+            if loaded is None:
+                loaded = _load(dispatcher)
+            return loaded(*arguments)
 
         return call
 

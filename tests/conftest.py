@@ -68,11 +68,12 @@ SILENT = Rule(lambda n: np.zeros(n), lambda s, k, r, informed: (s, Verdict(s > 0
 
 def states(plant, filter, obs, begun=None):
     """The state of a filter after each sample of observations (N, K, n_obs); `begun`: a state to start from."""
-    s = filtering._start(plant, filter, SILENT, len(obs))
+    start, step = filtering.shell(plant, filter, SILENT)
+    s = start(len(obs))
     if begun is not None:
         s = s._replace(filter=begun)
     for k in range(obs.shape[1]):
-        s, *_ = filtering._step(plant, filter, SILENT, s, obs[:, k])
+        s, *_ = step(s, obs[:, k])
         yield s.filter
 
 

@@ -10,7 +10,7 @@ from baselines.filters.mekf import observation
 from fdi_gym.diagnosis import find_diagnoser, make_diagnoser, run
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
-from fdi_gym.estimation.augmented import Interval
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.sigma_points import covariance, mean_and_deviations, unscented_points, weights
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plants import cmg_satellite as cmg

@@ -14,12 +14,13 @@ from baselines.filters.augmented_gaussian import gaussian_filter
 from fdi_gym.diagnosis import NotApplicableError, diagnosers, fit, fitting, knowledge, make_diagnoser, run
 from fdi_gym.diagnosis.fitting import VALIDATION_SEED, fit_belief, flights_of, long_run
 from fdi_gym.engine import simulate
-from fdi_gym.estimation.augmented import Interval, augmented
+from fdi_gym.estimation.augmented import augmented
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration, Persistence, gain
 from fdi_gym.estimation.data import digest, from_json, to_json
 from fdi_gym.estimation.decision import STATISTICS, Reading, chi_square, cusum, declare, glr, undeclared
 from fdi_gym.estimation.gaussian import RULES
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.labels import Manifolds, nearest_of
 from fdi_gym.estimation.linear import linear_model
 from fdi_gym.faults import draw
@@ -430,7 +431,7 @@ def test_nearest_point_of_a_box(f):
     rng = np.random.default_rng(f)
     p, h, n, at_bounds = 5, 3, 20, 0
     sets = Manifolds(
-        np.arange(1, h + 1), rng.standard_normal((h, p)), rng.standard_normal((h, p, f)),
+        np.arange(1, h + 1), np.full(h, f), rng.standard_normal((h, p)), rng.standard_normal((h, p, f)),
         -rng.uniform(0, 0.6, (h, f)), rng.uniform(0, 0.6, (h, f)),
     )  # fmt: skip
     root = rng.standard_normal((n, p, p)) + np.eye(p)

@@ -15,10 +15,10 @@ from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, guarded, run
 from fdi_gym.diagnosis.filtering import readings
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import no_noise, simulate
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.belief import Belief, fault_inputs
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_channels
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.labels import channel_sets, label_of_channels
 from fdi_gym.estimation.linear import linear_output
 from fdi_gym.faults import FaultProcess, FaultScenario

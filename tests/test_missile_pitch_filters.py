@@ -19,9 +19,9 @@ from fdi_gym.diagnosis import NotApplicableError, diagnoser_of, find_diagnoser, 
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
 from fdi_gym.estimation import mixing
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.calibration import Persistence
 from fdi_gym.estimation.decision import Reading
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plants import missile_pitch as missile
 from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env

@@ -16,10 +16,11 @@ import numpy as np
 from baselines.filters.augmented_gaussian import Gaussian, gaussian_filter, reading_of
 from baselines.filters.covariance_adaptation import BETA_0, INC_JOINT, MEMORY, Search, Trial, binary_grid, element_grid
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import AugmentedModel, Interval, augmented
+from fdi_gym.estimation.augmented import AugmentedModel, augmented
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import by_labels
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import quadratic
 from fdi_gym.plant import Array, Plant
 

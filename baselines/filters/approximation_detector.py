@@ -25,10 +25,10 @@ import numpy as np
 from baselines.filters import missile_model as model
 from baselines.filters.missile_model import RANGE, Known
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.automaton import Automaton
 from fdi_gym.estimation.calibration import Persistence
 from fdi_gym.estimation.decision import Reading, Rule, Verdict, declare, undeclared
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.missile_pitch import DEG, DT
 

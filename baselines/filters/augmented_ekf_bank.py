@@ -15,10 +15,10 @@ from baselines.filters import missile_ekf as ekf
 from baselines.filters import missile_model as model
 from baselines.filters.missile_ekf import Filters
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.automaton import Automaton
 from fdi_gym.estimation.calibration import Persistence
 from fdi_gym.estimation.decision import Evidence, Reading, Rule, Verdict, declare, undeclared
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.plant import Array, Plant
 
 

@@ -19,8 +19,8 @@ from baselines.filters import missile_model as model
 from baselines.filters.missile_ekf import JAM, Filters
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.estimation import mixing
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading, by_candidate
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.missile_pitch import DEG, DT
 

@@ -15,11 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import AugmentedModel, Interval, augmented
+from fdi_gym.estimation.augmented import AugmentedModel, augmented
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_labels
 from fdi_gym.estimation.gaussian import RULES
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.plant import Array, Plant
 
 
@@ -60,7 +61,7 @@ def gaussian_filter(model: AugmentedModel, rule: str, first_sample: bool = True)
 
     def update(s: Gaussian, at: Interval, y: Array, seen: Array) -> Gaussian:
         c = model.update(rule, s.X, s.P, at, y, seen)
-        return Gaussian(c.X, c.P, c.nu, c.S, seen[:, model.sensors].sum(axis=1))
+        return Gaussian(c.X, c.P, c.nu, c.S, c.count)
 
     return Filter(
         start, predict, update, lambda s: reading_of(model, s), first_sample,

@@ -10,12 +10,13 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 
 from baselines.filters.two_stage_kf import aging, decision_rule, initial_covariances
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval, plus_held_commands
+from fdi_gym.estimation import gaussian
 from fdi_gym.estimation.decision import Reading
-from fdi_gym.estimation.kalman import T, symmetric, times, update
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.linear import linear_model
 from fdi_gym.plant import Array, Plant
 
@@ -32,40 +33,34 @@ class AugmentedState(NamedTuple):
 
 def augmented_filter(plant: Plant, aged: Callable[[Array], Array]) -> Filter:
     """The Kalman filter of F = [A E_k; 0 I], with the time update `aged` of the fault parameter's covariance."""
-    model = linear_model(plant)
+    linear = linear_model(plant)
     P_x, P_z = initial_covariances(plant)
-    n_x, n_y = len(P_x), len(plant.outputs)
-    N = n_x + len(P_z)
-    H = np.zeros((n_y, N))
-    H[:, :n_x] = model.C
-    Q = np.zeros((N, N))
-    Q[:n_x, :n_x] = plant.Q
+    n_x, n_y, p = len(P_x), len(plant.outputs), len(P_z)
+    N, scale = n_x + p, [s.scale for s in (*plant.states, *plant.theta)]
+    model = gaussian.bind(plant, scale=scale, entries=range(p), H=np.hstack([linear.C, np.zeros((n_y, p))]))
+    P0, Q = (scipy.linalg.block_diag(x, z) for x, z in ((P_x, P_z), (plant.Q, np.zeros((p, p)))))
+    Q, R, t = Q[None], plant.R[None], np.zeros(1)  # a linear plant knows no time
 
     def start(n: int) -> AugmentedState:
-        P = np.zeros((n, N, N))
-        P[:, :n_x, :n_x], P[:, n_x:, n_x:] = P_x, P_z
-        return AugmentedState(
-            np.zeros((n, N)), P, np.zeros((n, n_y)), np.tile(np.eye(n_y), (n, 1, 1)), np.zeros(n, np.int64)
-        )
+        S = np.tile(np.eye(n_y), (n, 1, 1))
+        return AugmentedState(np.zeros((n, N)), np.tile(P0, (n, 1, 1)), np.zeros((n, n_y)), S, np.zeros(n, np.int64))
 
     def predict(s: AugmentedState, at: Interval) -> AugmentedState:
-        F = np.tile(np.eye(N), (len(s.X), 1, 1))
-        F[:, :n_x, :n_x], F[:, :n_x, n_x:] = model.A, model.E(at.u)
-        X = times(F, s.X)
-        X[:, :n_x] += times(model.B, at.u)
-        P = plus_held_commands(plant, F @ s.P @ T(F) + Q, s.X[:, :n_x], at)
-        Pz = s.P[:, n_x:, n_x:]
-        P[:, n_x:, n_x:] += aged(Pz) - Pz
-        return s._replace(X=X, P=symmetric(P))
+        X, P = gaussian.predict(model, "extended", s.X, s.P, t, at.u, None, at.noise(Q))
+        before = s.P[:, n_x:, n_x:]
+        after = aged(before)
+        if after is not before:
+            P[:, n_x:, n_x:] += after - before
+        return s._replace(X=X, P=P)
 
-    def correct(s: AugmentedState, at: Interval, y: Array, seen: Array) -> AugmentedState:
-        done = update(s.X, s.P, y - times(H, s.X), H, plant.R, seen)
-        return AugmentedState(done.x, done.P, done.nu, done.S, seen.sum(axis=1))
+    def update(s: AugmentedState, at: Interval, y: Array, seen: Array) -> AugmentedState:
+        done = gaussian.update(model, "extended", s.X, s.P, t, at.u, None, y, seen, R)
+        return AugmentedState(done.X, done.P, done.nu, done.S, done.count)
 
     def read(s: AugmentedState) -> Reading:
         return Reading(s.X[:, n_x:], s.P[:, n_x:, n_x:], s.X[:, :n_x], s.P[:, :n_x, :n_x], s.nu, s.S, s.seen)
 
-    return Filter(start, predict, correct, read, first_sample=False)
+    return Filter(start, predict, update, read, first_sample=False)
 
 
 @diagnoser("augmented_kf", "Augmented Kalman filter, exponential forgetting", forgetting="exponential")

@@ -19,10 +19,10 @@ import numpy as np
 from scipy.special import log_ndtr, logsumexp
 
 from baselines.filters import kalman_filter
-from baselines.filters.kalman_filter import Healthy, sense
+from baselines.filters.kalman_filter import Healthy, Nominal, sense
 from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading, Rule, by_candidate
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.plant import Array, Plant
 
 # (label, type, prior weight): per surface LOE 0.25, random position 0.15, jam 0.10
@@ -115,6 +115,74 @@ class Onsets(NamedTuple):
     z: Array  # (n, 4)
 
 
+class Clock(NamedTuple):
+    """When a fault may begin, and with which prior."""
+
+    first_onset: int
+    last_onset: int
+    grid: int  # samples between onset hypotheses
+    horizon: int  # length of the process's flights
+    p_fault: float
+
+    @property
+    def slots(self) -> int:
+        """Onset hypotheses."""
+        return len(range(self.first_onset, self.last_onset + 1, self.grid))
+
+    def used(self, k: Array) -> int:
+        """Slots that any episode has in use at the samples k (n,)."""
+        return int(np.clip((k.max() - 1 - self.first_onset) // self.grid + 1, 0, self.slots))
+
+
+def posterior(s: Onsets, m: int, sizes: Sizes) -> tuple[Array, Array]:
+    """log weights (n, 1 + 6 m) of no fault and of each onset and type, and the expected deviations (n, m, 6, 4)."""
+    ratio, z = marginals(s.G[:, :m], s.g[:, :m], s.u_onset[:, :m], sizes)
+    types = ratio + LOG_WEIGHT + s.log_prior[:, 1 : m + 1, None]
+    return np.concatenate([s.log_prior[:, :1], types.reshape(len(z), -1)], axis=1), z
+
+
+def begun(s: Onsets, step: Array, u: Array, clock: Clock, sizes: Sizes) -> Onsets:
+    """New onset hypotheses, where one begins with this step (n,); past the last slot in place of the least probable one."""
+    T, each = clock.slots, clock.p_fault / clock.slots
+    late = step - clock.first_onset
+    new = np.flatnonzero((late >= 0) & (late % clock.grid == 0) & ((step <= clock.last_onset) | (step >= clock.horizon)))
+    if not new.size:
+        return s
+    slot = late[new] // clock.grid
+    M, G, g, u_onset, log_prior = (a.copy() for a in (s.M, s.G, s.g, s.u_onset, s.log_prior))
+    beyond = slot >= T
+    if beyond.any():
+        log, _ = posterior(s, T, sizes)
+        slot[beyond] = np.argmin(log[new[beyond], 1:].reshape(-1, T, 6).max(axis=2), axis=1)
+    M[new, slot], G[new, slot], g[new, slot], u_onset[new, slot] = 0.0, 0.0, 0.0, u[new]
+    share = np.where(beyond, each / (1 - clock.p_fault), 1.0)  # of what is left of "no fault", once it is p_fault
+    mass = np.exp(log_prior[new, 0])
+    fresh = np.where(beyond, mass * (1 - np.exp(-share)), each)
+    log_prior[new, 1 + slot] = np.log(fresh)
+    log_prior[new, 0] = np.log(mass - fresh)
+    return s._replace(M=M, G=G, g=g, u_onset=u_onset, log_prior=log_prior)
+
+
+def gathered(s: Onsets, f: Nominal, healthy: Healthy, u: Array, m: int) -> Onsets:
+    """What the hypotheses of the first m slots make of the sample that `healthy` has used."""
+    if not m:
+        return s._replace(healthy=healthy)
+    M, G, g = s.M.copy(), s.G.copy(), s.g.copy()
+    E = f.model.E(u)[:, None] * np.isfinite(s.log_prior[:, 1 : m + 1, None, None])
+    M[:, :m], G[:, :m], g[:, :m] = sense(f, healthy, M[:, :m], G[:, :m], g[:, :m], E)
+    return s._replace(healthy=healthy, M=M, G=G, g=g)
+
+
+def concluded(s: Onsets, m: int, now: Array, sizes: Sizes) -> Onsets:
+    """The answer from the posterior, in the episodes `now` (n,)."""
+    log, z = posterior(s, m, sizes)
+    w = np.exp(log - logsumexp(log, axis=1, keepdims=True))
+    types = w[:, 1:].reshape(len(now), m, 6)
+    probs = np.column_stack([w[:, 0], label_probabilities(types).sum(axis=1)])
+    mean = (types[..., None] * z).sum(axis=(1, 2))
+    return s._replace(probs=np.where(now[:, None], probs, s.probs), z=np.where(now[:, None], mean, s.z))
+
+
 @diagnoser("bayes_bank", "Bayes bank over onsets and types, true priors: the bound of the standard process")
 def bayes_bank(
     plant: Plant,
@@ -147,67 +215,24 @@ def bayes_bank(
     """
     check(plant)
     f, sizes = kalman_filter.nominal_filter(plant), Sizes((gamma[0], gamma[1]), (b_max[0], b_max[1]))
-    T = len(range(first_onset, last_onset + 1, grid))
-    each = np.log(p_fault / T)
+    clock = Clock(first_onset, last_onset, grid, horizon, p_fault)
 
     def start(n: int) -> Onsets:
-        log_prior = np.full((n, 1 + T), -np.inf)
+        T, log_prior = clock.slots, np.full((n, 1 + clock.slots), -np.inf)
         log_prior[:, 0] = 0.0
         return Onsets(
             kalman_filter.start(f, plant, n), np.zeros((n, T, 4, 4)), np.zeros((n, T, 4, 4)), np.zeros((n, T, 4)),
             np.zeros((n, T, 2)), log_prior, np.tile([1.0, 0, 0, 0, 0], (n, 1)), np.zeros((n, 4)),
         )  # fmt: skip
 
-    def posterior(s: Onsets, m: int) -> tuple[Array, Array]:
-        """log weights (n, 1 + 6 m) of no fault and of each onset and type, and the expected deviations (n, m, 6, 4)."""
-        ratio, z = marginals(s.G[:, :m], s.g[:, :m], s.u_onset[:, :m], sizes)
-        types = ratio + LOG_WEIGHT + s.log_prior[:, 1 : m + 1, None]
-        return np.concatenate([s.log_prior[:, :1], types.reshape(len(z), -1)], axis=1), z
-
-    def begin(s: Onsets, step: Array, u: Array) -> Onsets:
-        """New onset hypotheses, where one begins with this step (n,)."""
-        late = step - first_onset
-        new = np.flatnonzero((late >= 0) & (late % grid == 0) & ((step <= last_onset) | (step >= horizon)))
-        if not new.size:
-            return s
-        slot = late[new] // grid
-        M, G, g, u_onset, log_prior = (a.copy() for a in (s.M, s.G, s.g, s.u_onset, s.log_prior))
-        beyond = slot >= T
-        if beyond.any():
-            log, _ = posterior(s, T)
-            slot[beyond] = np.argmin(log[new[beyond], 1:].reshape(-1, T, 6).max(axis=2), axis=1)
-        M[new, slot], G[new, slot], g[new, slot], u_onset[new, slot] = 0.0, 0.0, 0.0, u[new]
-        share = np.where(beyond, np.exp(each) / (1 - p_fault), 1.0)  # of what is left of "no fault", once it is p_fault
-        mass = np.exp(log_prior[new, 0])
-        begun = np.where(beyond, mass * (1 - np.exp(-share)), np.exp(each))
-        log_prior[new, 1 + slot] = np.log(begun)
-        log_prior[new, 0] = np.log(mass - begun)
-        return s._replace(M=M, G=G, g=g, u_onset=u_onset, log_prior=log_prior)
-
-    def count(k: Array) -> int:
-        """Slots that any episode has in use."""
-        return int(np.clip((k.max() - 1 - first_onset) // grid + 1, 0, T))
-
     def predict(s: Onsets, at: Interval) -> Onsets:
-        return begin(s, at.k - 1, at.u)._replace(healthy=kalman_filter.predict(f, plant, s.healthy, at))
+        s = begun(s, at.k - 1, at.u, clock, sizes)
+        return s._replace(healthy=kalman_filter.predict(f, s.healthy, at))
 
     def update(s: Onsets, at: Interval, y: Array, seen: Array) -> Onsets:
-        healthy, m = kalman_filter.correct(f, s.healthy, y, seen), count(at.k)
-        M, G, g = s.M, s.G, s.g
-        if m:
-            M, G, g = M.copy(), G.copy(), g.copy()
-            E = f.model.E(at.u)[:, None] * np.isfinite(s.log_prior[:, 1 : m + 1, None, None])
-            M[:, :m], G[:, :m], g[:, :m] = sense(f, healthy, M[:, :m], G[:, :m], g[:, :m], E)
-        s = s._replace(healthy=healthy, M=M, G=G, g=g)
-        now = at.k % decide_every == 0
-        if not now.any():
-            return s
-        log, z = posterior(s, m)
-        w = np.exp(log - logsumexp(log, axis=1, keepdims=True))
-        types = w[:, 1:].reshape(len(y), m, 6)
-        probs = np.column_stack([w[:, 0], label_probabilities(types).sum(axis=1)])
-        mean = (types[..., None] * z).sum(axis=(1, 2))
-        return s._replace(probs=np.where(now[:, None], probs, s.probs), z=np.where(now[:, None], mean, s.z))
+        m, now = clock.used(at.k), at.k % decide_every == 0
+        s = gathered(s, f, kalman_filter.correct(f, s.healthy, y, seen), at.u, m)
+        return concluded(s, m, now, sizes) if now.any() else s
 
     def read(s: Onsets) -> Reading:
         return Reading(s.z, x=s.healthy.x, Px=s.healthy.P, nu=s.healthy.nu, probs=s.probs)

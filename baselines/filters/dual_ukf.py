@@ -17,8 +17,8 @@ from baselines.filters.covariance_adaptation import BETA_0, FaultFlag, Search, T
 from baselines.filters.effectiveness import F_MAX, F_MIN, P_THETA, Q_THETA, THRESHOLD, threshold_rule
 from baselines.filters.joint_ukf import N_SEEN, N_XI, Attitude, corrected, expected, reading_of, wide_prior
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import Corrected, correct
 from fdi_gym.estimation.sigma_points import covariance, mean_and_deviations, unscented_points, weights
 from fdi_gym.plant import Array, Plant

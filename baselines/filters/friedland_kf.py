@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from baselines.filters.two_stage_kf import TwoStage, decision_rule, initial_covariances, open_state, read, start
+from baselines.filters.two_stage_kf import TwoStage, decision_rule, initial_covariances, read, start
 from baselines.filters.two_stage_kf import correct as two_stage_correct
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.estimation.kalman import symmetric, times
@@ -41,7 +41,7 @@ def friedland_kf(plant: Plant, *, q_bias: float = 0.0, threshold: float = 8.0, r
     P_x, P_z = initial_covariances(plant)
     filter = Filter(
         lambda n: start(n, len(plant.outputs), P_x, P_z),
-        lambda s, at: open_state(plant, predict(s, at.u, model, plant.Q, Qz), at),
+        lambda s, at: predict(s, at.u, model, at.noise(plant.Q), Qz),
         lambda s, at, y, seen: two_stage_correct(s, y, seen, model.C, plant.R),
         read,
         first_sample=False,

@@ -22,8 +22,8 @@ from baselines.filters import missile_model as model
 from baselines.filters.approximation_detector import NOISE_FACTOR, NU_0, Detector, Estimator, arrive, coast
 from baselines.filters.missile_model import Known
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading, Rule, Verdict
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.missile_pitch import DEG, DT
 

@@ -18,10 +18,11 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import AugmentedModel, Interval, augmented, plus_held_commands
+from fdi_gym.estimation.augmented import AugmentedModel, augmented
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_labels
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T, masked, right_divide, symmetric, times
 from fdi_gym.estimation.labels import manifolds, nearest_of
 from fdi_gym.plant import Array, Plant
@@ -97,7 +98,8 @@ def glr_filter(plant: Plant, model: AugmentedModel, size: Array, onsets: int, sp
     rest, p, m = model.rest, len(low), len(model.R)
     N, Q = len(rest), model.Q[np.ix_(rest, rest)]
     fade = 1.0 - 1.0 / (onsets * spacing)
-    groups, labels = manifolds(plant), len(plant.labels)
+    sets, labels = manifolds(plant), len(plant.labels)
+    h = len(sets.labels)
 
     def start(n: int) -> Ratio:
         return Ratio(
@@ -119,7 +121,7 @@ def glr_filter(plant: Plant, model: AugmentedModel, size: Array, onsets: int, sp
                 for a in (M, G, g)
             )
         f = linearised(model, lambda points: model.f(points, at), s.X, low, high, rest)
-        P = plus_held_commands(plant, symmetric(f.A @ s.P @ T(f.A)) + Q, s.X[:, model.x], at)
+        P = symmetric(f.A @ s.P @ T(f.A)) + at.noise(Q)
         return s._replace(X=f.mean, P=P, M=f.A[:, None] @ M + f.E[:, None], G=G, g=g, faults=np.ones_like(s.faults))
 
     def update(s: Ratio, at: Interval, y: Array, seen: Array) -> Ratio:
@@ -142,15 +144,11 @@ def glr_filter(plant: Plant, model: AugmentedModel, size: Array, onsets: int, sp
     def read(s: Ratio) -> Reading:
         n, x = len(s.X), model.x
         cost, z = np.zeros((n, labels)), np.zeros((n, labels, p))
-        for sets in groups:
-            value, magnitude = nearest_of(s.G.reshape(n * onsets, p, p), s.g.reshape(n * onsets, p), sets)
-            h = len(sets.labels)
-            value, magnitude = value.reshape(n, onsets, h), magnitude.reshape(n, onsets, h, -1)
-            when = np.argmin(value, axis=1)  # (n, h)
-            rows, columns = np.arange(n)[:, None], np.arange(h)
-            cost[:, sets.labels] = value[rows, when, columns]
-            best = magnitude[rows, when, columns]  # (n, h, f)
-            z[:, sets.labels] = sets.offset + (sets.direction @ best[..., None])[..., 0]
+        value, magnitude = nearest_of(s.G.reshape(n * onsets, p, p), s.g.reshape(n * onsets, p), sets)
+        value, magnitude = value.reshape(n, onsets, h), magnitude.reshape(n, onsets, h, -1)
+        rows, columns, when = np.arange(n)[:, None], np.arange(h), np.argmin(value, axis=1)  # (n, h)
+        cost[:, sets.labels] = value[rows, when, columns]
+        z[:, sets.labels] = sets.points(magnitude[rows, when, columns])
         chosen = z[np.arange(n), np.argmin(cost, axis=1)]
         return Reading(chosen, None, s.X[:, x], s.P[:, x, x], s.nu, s.S, s.seen, cost)
 

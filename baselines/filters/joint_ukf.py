@@ -14,15 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from baselines.filters import attitude_kernels
 from baselines.filters.attitude import require_attitude, taken, with_scalar, without_scalar
 from baselines.filters.covariance_adaptation import BETA_0, FaultFlag, Search, Trial, flagged, unflagged
 from baselines.filters.effectiveness import F_MAX, F_MIN, P_THETA, Q_THETA, THRESHOLD, threshold_rule
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import Corrected, correct, quadratic
-from fdi_gym.estimation.sigma_points import covariance, mean_and_deviations, unscented_points, weights
-from fdi_gym.plant import Array, Plant
+from fdi_gym.plant import Array, Plant, contiguous
 from fdi_gym.plants.cmg_satellite import SIGMA_Q
 
 N_XI, N_X, N_SEEN = 10, 14, 6  # (q_v, w, d); with f; the channels that carry fault information: q_v and w
@@ -50,12 +50,14 @@ class JointUKF(NamedTuple):
 
 
 def predicted(plant: Plant, Q: Array, s: Attitude, u: Array) -> Attitude:
-    """x (n, 14) one interval later, under the command u."""
-    points, w = unscented_points(s.x, s.P), weights(N_X)
-    moved = plant.propagate(0.0, with_scalar(points[..., :N_XI], s.sign), u, points[..., N_XI:])
-    points[..., :N_XI], sign = without_scalar(moved)
-    mean, deviations = mean_and_deviations(points, w)
-    return Attitude(mean, covariance(deviations, deviations, w) + Q, sign[:, 0])
+    """x (n, 14) one interval later, under the command u: the unscented transform, lambda = 2, with equal weights."""
+    x, P, sign = np.empty(s.x.shape), np.empty(s.P.shape), np.empty(len(s.x))
+    dynamics, project = plant.addresses[0], plant.addresses[4]
+    attitude_kernels.predict(
+        dynamics, project, plant.dt, plant.substeps, plant.nominal_p, contiguous(s.x), contiguous(s.P), s.sign,
+        contiguous(u), Q, x, P, sign,
+    )  # fmt: skip
+    return Attitude(x, P, sign)
 
 
 def corrected(R: Array, s: Attitude, y: Array, seen: Array) -> Corrected:

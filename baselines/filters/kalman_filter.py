@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from fdi_gym.estimation.augmented import Interval, plus_held_commands
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T, solve, symmetric, times, update
 from fdi_gym.estimation.linear import LinearModel, linear_model
 from fdi_gym.plant import Array, Plant
@@ -57,11 +57,10 @@ def start(f: Nominal, plant: Plant, n: int) -> Healthy:
     )  # fmt: skip
 
 
-def predict(f: Nominal, plant: Plant, s: Healthy, at: Interval) -> Healthy:
+def predict(f: Nominal, s: Healthy, at: Interval) -> Healthy:
     """Over an interval."""
     A = f.model.A
-    P = plus_held_commands(plant, A @ s.P @ A.T + f.Q, s.x, at)
-    return s._replace(x=times(A, s.x) + times(f.model.B, at.u), P=P)
+    return s._replace(x=times(A, s.x) + times(f.model.B, at.u), P=A @ s.P @ A.T + at.noise(f.Q))
 
 
 def correct(f: Nominal, s: Healthy, y: Array, seen: Array) -> Healthy:

@@ -19,8 +19,8 @@ from baselines.filters.attitude import cross, require_attitude, rotated, taken, 
 from baselines.filters.effectiveness import F_MAX, F_MIN, P_THETA, Q_THETA, THRESHOLD, threshold_rule
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.estimation import kalman
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T, quadratic, times
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.cmg_satellite import DT, H0, JS, SIGMA_Q, cluster, inertia
@@ -29,6 +29,8 @@ NIS_START = 6.0  # the mean of a chi-square with six degrees of freedom
 NIS_MAX, MEMORY = 10.0, 50  # detector: threshold of the weighted mean, and its length in steps
 P_RESET = 0.25  # variance of each effectiveness after a reset
 D_GAIN = 0.002  # gain of the gimbal angles towards the measured ones, at least
+
+ATTITUDE, RATE, THETA = np.arange(3), np.arange(3, 6), np.arange(6, 10)  # of the error state
 
 
 class MEKF(NamedTuple):
@@ -93,6 +95,32 @@ def first_covariance(q: Array, R: Array, p_theta: float) -> Array:
                  first_variance(q, R), np.ones((len(q), 6), bool))[1]  # fmt: skip
 
 
+def begun(s: MEKF, y: Array, seen: Array, R: Array) -> MEKF:
+    """Attitude and rate as they are reported for the first time."""
+    fresh = seen[:, :6] & ~s.known
+    fresh[:, :3] = (fresh[:, :3].all(axis=1) & seen[:, 10])[:, None]
+    if not fresh.any():
+        return s
+    q = np.where(fresh[:, :1], with_scalar(y[:, None, :3], y[:, 10])[:, 0], s.q)
+    x = np.concatenate([np.zeros_like(s.w), s.w, s.f], axis=1)
+    x, P = taken(x, s.P, y[:, :6], first_variance(q, R), fresh)
+    return s._replace(q=q, w=x[:, 3:6], P=P, known=s.known | fresh)
+
+
+def opened(s: MEKF, now: Array, y: Array, seen: Array, R: Array, p_reset: float, memory: int) -> MEKF:
+    """A reset in the episodes `now`: the covariance of the effectiveness is opened and its correlations are forgotten."""
+    if not now.any():
+        return s
+    w, P, nis, rows = s.w.copy(), s.P.copy(), s.nis.copy(), np.flatnonzero(now)
+    w[now] = np.where(seen[now, 3:6], y[now, 3:6], w[now])
+    P[now, 6:, :6] = P[now, :6, 6:] = 0.0
+    P[np.ix_(rows, THETA, THETA)] = p_reset * np.eye(4)
+    for part, extra in ((ATTITUDE, 4.0 * np.diag(R)[:3]), (RATE, np.diag(R)[3:6])):
+        P[np.ix_(rows, part, part)] += np.diag(extra)
+    nis[now] = NIS_START
+    return s._replace(w=w, P=P, nis=nis, wait=np.where(now, s.samples + memory, s.wait), resets=s.resets + now)
+
+
 def mekf_filter(
     plant: Plant,
     known_changes: Array | None = None,
@@ -110,7 +138,6 @@ def mekf_filter(
     Q = np.diag([0.0] * 3 + [SIGMA_Q**2] * 3 + [q_theta] * 4)
     scale = np.array([s.scale for s in plant.states])
     P_0 = np.diag([*(2.0 * scale[:3]) ** 2, *scale[4:7] ** 2, *[p_theta] * 4])  # an angle is twice its q_v
-    attitude, rate, theta = np.arange(3), np.arange(3, 6), np.arange(6, 10)
 
     def start(n: int) -> MEKF:
         x, count = np.tile(plant.trim_state, (n, 1)), np.zeros(n, np.int64)
@@ -124,30 +151,6 @@ def mekf_filter(
         Phi = transition(s.q, s.w, s.d, s.f, at.u, wheel)
         x = plant.propagate(0.0, np.concatenate([s.q, s.w, s.d], axis=1), at.u, s.f)
         return s._replace(q=x[:, :4], w=x[:, 4:7], d=x[:, 7:], P=Phi @ s.P @ T(Phi) + Q)
-
-    def begun(s: MEKF, y: Array, seen: Array) -> MEKF:
-        """Attitude and rate as they are reported for the first time."""
-        fresh = seen[:, :6] & ~s.known
-        fresh[:, :3] = (fresh[:, :3].all(axis=1) & seen[:, 10])[:, None]
-        if not fresh.any():
-            return s
-        q = np.where(fresh[:, :1], with_scalar(y[:, None, :3], y[:, 10])[:, 0], s.q)
-        x = np.concatenate([np.zeros_like(s.w), s.w, s.f], axis=1)
-        x, P = taken(x, s.P, y[:, :6], first_variance(q, R), fresh)
-        return s._replace(q=q, w=x[:, 3:6], P=P, known=s.known | fresh)
-
-    def reset(s: MEKF, now: Array, y: Array, seen: Array) -> MEKF:
-        """Open the covariance of the effectiveness in the episodes `now`."""
-        if not now.any():
-            return s
-        w, P, nis, rows = s.w.copy(), s.P.copy(), s.nis.copy(), np.flatnonzero(now)
-        w[now] = np.where(seen[now, 3:6], y[now, 3:6], w[now])
-        P[now, 6:, :6] = P[now, :6, 6:] = 0.0
-        P[np.ix_(rows, theta, theta)] = p_reset * np.eye(4)
-        for part, extra in ((attitude, 4.0 * np.diag(R)[:3]), (rate, np.diag(R)[3:6])):
-            P[np.ix_(rows, part, part)] += np.diag(extra)
-        nis[now] = NIS_START
-        return s._replace(w=w, P=P, nis=nis, wait=np.where(now, s.samples + memory, s.wait), resets=s.resets + now)
 
     def due(s: MEKF, k: Array) -> Array:
         if known_changes is not None:
@@ -168,9 +171,9 @@ def mekf_filter(
             nis=np.where(counts, s.nis + (nis - s.nis) / memory, s.nis), samples=s.samples + counts,
             nu=done.nu, S=done.S, seen=used.sum(axis=1),
         )  # fmt: skip
-        s = begun(s, y, seen)
+        s = begun(s, y, seen, R)
         now = due(s, at.k)
-        return reset(s, now, y, seen)._replace(reset=now)
+        return opened(s, now, y, seen, R, p_reset, memory)._replace(reset=now)
 
     def read(s: MEKF) -> Reading:
         flag = s.reset & (known_changes is None)  # a reset at a change that was known is no flag

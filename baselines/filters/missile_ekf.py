@@ -12,8 +12,8 @@ import numpy as np
 
 from baselines.filters import missile_model as model
 from baselines.filters.missile_model import Known
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading, Rule, Verdict
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T, correct
 from fdi_gym.estimation.kalman import log_likelihood as gaussian
 from fdi_gym.plant import Array

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi_gym.diagnosis import NotApplicableError
-from fdi_gym.estimation.augmented import Interval
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.missile_pitch import (
     A_M,

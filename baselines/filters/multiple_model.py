@@ -16,10 +16,11 @@ import numpy as np
 
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.estimation import mixing
-from fdi_gym.estimation.augmented import AugmentedModel, Interval, augmented
+from fdi_gym.estimation.augmented import AugmentedModel, augmented
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_labels
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.plant import Array, Plant
 
 SMALLEST_MAGNITUDE, SLOWEST_WALK = 0.05, 1e-3  # standard deviations, in units of the mode's root mean square

@@ -14,8 +14,8 @@ import numpy as np
 from baselines.filters.two_stage_kf import TwoStage, aging, decision_rule, initial_covariances, start, two_stage_filter
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.diagnosis.contract import choose
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading, by_candidate
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.labels import distances, manifolds
 from fdi_gym.plant import Array, Plant
 
@@ -47,7 +47,7 @@ def restart_kf(
     """
     detector = two_stage_filter(plant, aging(plant, 0.0, "exponential", factor, 0.0, a_max))
     second = two_stage_filter(plant, lambda Pz: Pz)
-    rule, groups = decision_rule(plant, "distance", threshold, release_after), manifolds(plant)
+    rule, sets = decision_rule(plant, "distance", threshold, release_after), manifolds(plant)
     P_x, P_z = initial_covariances(plant)
 
     def begin(n: int) -> Restarted:
@@ -66,9 +66,9 @@ def restart_kf(
         return Restarted(first, other, decision, verdict.alarm)
 
     def read(s: Restarted) -> Reading:
-        fits = distances(s.second.z, s.second.Pz, groups)
+        fits = distances(s.second.z, s.second.Pz, sets)
         cost = np.full((len(s.alarm), len(plant.labels)), np.inf)
-        cost[:, fits.labels] = np.where(s.alarm[:, None], fits.J, np.inf)
+        cost[:, sets.labels] = np.where(s.alarm[:, None], fits.J[:, 1:], np.inf)
         cost[:, 0] = np.where(s.alarm, np.inf, 0.0)
         z, filter = np.where(s.alarm[:, None], s.second.z, 0.0), s.detector
         return Reading(z, s.second.Pz, filter.state(), filter.covariance(), filter.nu, filter.S, filter.seen, cost)

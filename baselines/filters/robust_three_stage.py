@@ -28,10 +28,10 @@ from baselines.filters.propagation import Propagated, propagation_of, trim_model
 from baselines.filters.unknown_inputs import Known, decided, known_of
 from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser
 from fdi_gym.diagnosis.contract import choose
-from fdi_gym.estimation.augmented import Interval, plus_held_commands
 from fdi_gym.estimation.belief import Belief, FaultInputs
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T, masked, right_divide, solve, symmetric, times
 from fdi_gym.plant import Array, Plant
 
@@ -232,11 +232,10 @@ def robust_three_stage_filter(plant: Plant, known: Known, rule: str) -> Filter:
 
     def ahead(s: RobustThreeStage, at: Interval) -> RobustThreeStage:
         none = np.zeros((len(s.x), p)), np.zeros((len(s.x), q))
-        after = predict(s, propagate((at.k - 1) * plant.dt, s.x, s.P, at.u, *none), known.Q)
         held = s.held & (s.seen == 0)  # the interval goes on
-        if at.stale is None:
-            return after._replace(held=held)
-        return after._replace(P=plus_held_commands(plant, after.P, s.x, at), held=held | (at.stale > 0).any(axis=1))
+        if at.stale is not None:
+            held = held | (at.stale > 0).any(axis=1)
+        return predict(s, propagate((at.k - 1) * plant.dt, s.x, s.P, at.u, *none), at.noise(known.Q))._replace(held=held)
 
     def measured(s: RobustThreeStage, at: Interval, y: Array, seen: Array) -> RobustThreeStage:
         return update(s, y[:, known.sensors], seen[:, known.sensors], known.H, known.R)

@@ -16,11 +16,11 @@ from scipy.special import logsumexp
 
 from baselines.filters import kalman_filter
 from baselines.filters.bayes_bank import LOG_WEIGHT, Sizes, check, label_probabilities, marginals, most_probable
-from baselines.filters.kalman_filter import Healthy, sense
+from baselines.filters.kalman_filter import Healthy, Nominal, sense
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.diagnosis.contract import map_arrays
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.plant import Array, Plant
 
 START, GRID = 200, 10  # first sample and period of the bookkeeping
@@ -90,6 +90,65 @@ class Switching(NamedTuple):
     z: Array  # (n, 4)
 
 
+def keep_books(s: Switching, step: int, u: Array, sizes: Sizes) -> Switching:
+    """Merge, end, begin: of episodes at the same step."""
+    at, n = turn(step), len(u)
+    M, G, g, u_onset, w = (a[:, : at.before] for a in (s.M, s.G, s.g, s.u_onset, s.w))
+    w_healthy = s.w_healthy
+    if at.old.any():
+        ratio, _ = marginals(G[:, at.old], g[:, at.old], u_onset[:, at.old], sizes)
+        merged = w[:, at.old] + logsumexp(ratio + LOG_WEIGHT, axis=2)
+        w_healthy = logsumexp(np.column_stack([w_healthy, merged]), axis=1)
+    w = np.concatenate(
+        [w[:, at.stays] + at.staying, w[:, at.ends] + at.leaving, (w_healthy + np.log(P_BEGIN))[:, None]], axis=1
+    )
+    fresh = (np.zeros((n, 1, 4, 4)), np.zeros((n, 1, 4, 4)), np.zeros((n, 1, 4)), u[:, None])
+    moved = [
+        np.concatenate([a[:, at.stays], a[:, at.ends], new], axis=1)
+        for a, new in zip((M, G, g, u_onset), fresh, strict=True)
+    ]
+    whole = [a.copy() for a in (s.M, s.G, s.g, s.u_onset, s.w)]
+    for a, new in zip(whole, (*moved, w), strict=True):
+        a[:, : new.shape[1]] = new
+    M, G, g, u_onset, w = whole
+    return Switching(s.healthy, w_healthy + np.log1p(-P_BEGIN), M, G, g, u_onset, w, s.probs, s.z)
+
+
+def weigh(s: Switching, k: int, E: Array, f: Nominal, sizes: Sizes) -> Switching:
+    """The hypotheses' information at sample k, and the answer where one is due."""
+    now = latest(k)
+    h, gone = len(now.begun), now.ended >= 0
+    if not h:
+        return s
+    M, G, g = s.M.copy(), s.G.copy(), s.g.copy()
+    M[:, :h], G[:, :h], g[:, :h] = sense(f, s.healthy, M[:, :h], G[:, :h], g[:, :h], E[:, None] * ~gone[:, None, None])
+    s = s._replace(M=M, G=G, g=g)
+    if k % GRID:
+        return s
+    ratio, z = marginals(G[:, :h], g[:, :h], s.u_onset[:, :h], sizes)
+    each = ratio + LOG_WEIGHT + s.w[:, :h, None]
+    top = np.maximum(each.max(axis=(1, 2)), s.w_healthy)
+    p = np.exp(each - top[:, None, None])
+    healthy = np.exp(s.w_healthy - top) + p[:, gone].sum(axis=(1, 2))
+    active = p[:, ~gone]
+    probs = np.column_stack([healthy, label_probabilities(active).sum(axis=1)])
+    total = probs.sum(axis=1, keepdims=True)
+    mean = (active[..., None] * z[:, ~gone]).sum(axis=(1, 2)) / total
+    return s._replace(probs=probs / total, z=mean)
+
+
+def by_clock(function: Callable[..., Switching], s: Switching, at: Interval, *arrays: Array) -> Switching:
+    """Apply to the episodes of each sample number together: there is one, but for episodes that began later."""
+    if (at.k == at.k[0]).all():
+        return function(s, int(at.k[0]), *arrays)
+    out = map_arrays(np.copy, s)
+    for k in np.unique(at.k):
+        rows = at.k == k
+        part = function(map_arrays(lambda a, rows=rows: a[rows], s), int(k), *(a[rows] for a in arrays))
+        map_arrays(lambda whole, new, rows=rows: whole.__setitem__(rows, new), out, part)
+    return out
+
+
 @diagnoser("switching_bayes_bank", "Bayes bank with fault and recovery hypotheses: reference for intermittent faults")
 def switching_bayes_bank(
     plant: Plant, *, gamma: tuple[float, float] = (-0.7, -0.2), b_max: tuple[float, float] = (4.0, 2.0)
@@ -114,72 +173,16 @@ def switching_bayes_bank(
             np.zeros((n, 4)),
         )  # fmt: skip
 
-    def keep_books(s: Switching, step: int, u: Array) -> Switching:
-        """Merge, end, begin: of episodes at the same step."""
-        at, n = turn(step), len(u)
-        M, G, g, u_onset, w = (a[:, : at.before] for a in (s.M, s.G, s.g, s.u_onset, s.w))
-        w_healthy = s.w_healthy
-        if at.old.any():
-            ratio, _ = marginals(G[:, at.old], g[:, at.old], u_onset[:, at.old], sizes)
-            merged = w[:, at.old] + logsumexp(ratio + LOG_WEIGHT, axis=2)
-            w_healthy = logsumexp(np.column_stack([w_healthy, merged]), axis=1)
-        w = np.concatenate(
-            [w[:, at.stays] + at.staying, w[:, at.ends] + at.leaving, (w_healthy + np.log(P_BEGIN))[:, None]], axis=1
-        )
-        fresh = (np.zeros((n, 1, 4, 4)), np.zeros((n, 1, 4, 4)), np.zeros((n, 1, 4)), u[:, None])
-        moved = [
-            np.concatenate([a[:, at.stays], a[:, at.ends], new], axis=1)
-            for a, new in zip((M, G, g, u_onset), fresh, strict=True)
-        ]
-        whole = [a.copy() for a in (s.M, s.G, s.g, s.u_onset, s.w)]
-        for a, new in zip(whole, (*moved, w), strict=True):
-            a[:, : new.shape[1]] = new
-        M, G, g, u_onset, w = whole
-        return Switching(s.healthy, w_healthy + np.log1p(-P_BEGIN), M, G, g, u_onset, w, s.probs, s.z)
-
-    def by_clock(function: Callable[..., Switching], s: Switching, at: Interval, *arrays: Array) -> Switching:
-        """Apply to the episodes of each sample number together: there is one, but for episodes that began later."""
-        if (at.k == at.k[0]).all():
-            return function(s, int(at.k[0]), *arrays)
-        out = map_arrays(np.copy, s)
-        for k in np.unique(at.k):
-            rows = at.k == k
-            part = function(map_arrays(lambda a, rows=rows: a[rows], s), int(k), *(a[rows] for a in arrays))
-            map_arrays(lambda whole, new, rows=rows: whole.__setitem__(rows, new), out, part)
-        return out
-
     def predict(s: Switching, at: Interval) -> Switching:
         def books(s: Switching, k: int, u: Array) -> Switching:
-            return keep_books(s, k - 1, u) if k - 1 >= START and (k - 1) % GRID == 0 else s
+            return keep_books(s, k - 1, u, sizes) if k - 1 >= START and (k - 1) % GRID == 0 else s
 
         s = by_clock(books, s, at, at.u)
-        return s._replace(healthy=kalman_filter.predict(f, plant, s.healthy, at))
+        return s._replace(healthy=kalman_filter.predict(f, s.healthy, at))
 
     def update(s: Switching, at: Interval, y: Array, seen: Array) -> Switching:
         s = s._replace(healthy=kalman_filter.correct(f, s.healthy, y, seen))
-        return by_clock(weigh, s, at, f.model.E(at.u))
-
-    def weigh(s: Switching, k: int, E: Array) -> Switching:
-        """The hypotheses' information at sample k, and the answer where one is due."""
-        now = latest(k)
-        h, gone = len(now.begun), now.ended >= 0
-        if not h:
-            return s
-        M, G, g = s.M.copy(), s.G.copy(), s.g.copy()
-        M[:, :h], G[:, :h], g[:, :h] = sense(f, s.healthy, M[:, :h], G[:, :h], g[:, :h], E[:, None] * ~gone[:, None, None])
-        s = s._replace(M=M, G=G, g=g)
-        if k % GRID:
-            return s
-        ratio, z = marginals(G[:, :h], g[:, :h], s.u_onset[:, :h], sizes)
-        each = ratio + LOG_WEIGHT + s.w[:, :h, None]
-        top = np.maximum(each.max(axis=(1, 2)), s.w_healthy)
-        p = np.exp(each - top[:, None, None])
-        healthy = np.exp(s.w_healthy - top) + p[:, gone].sum(axis=(1, 2))
-        active = p[:, ~gone]
-        probs = np.column_stack([healthy, label_probabilities(active).sum(axis=1)])
-        total = probs.sum(axis=1, keepdims=True)
-        mean = (active[..., None] * z[:, ~gone]).sum(axis=(1, 2)) / total
-        return s._replace(probs=probs / total, z=mean)
+        return by_clock(lambda s, k, E: weigh(s, k, E, f, sizes), s, at, f.model.E(at.u))
 
     def read(s: Switching) -> Reading:
         return Reading(s.z, x=s.healthy.x, Px=s.healthy.P, nu=s.healthy.nu, probs=s.probs)

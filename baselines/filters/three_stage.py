@@ -19,10 +19,10 @@ import numpy as np
 from baselines.filters.propagation import Propagated, propagation_of
 from baselines.filters.unknown_inputs import Known, decided, known_of
 from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser
-from fdi_gym.estimation.augmented import Interval, plus_held_commands
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T, masked, right_divide, symmetric, times
 from fdi_gym.plant import Array, Plant
 
@@ -154,8 +154,7 @@ def three_stage_filter(plant: Plant, known: Known, rule: str) -> Filter:
 
     def ahead(s: ThreeStage, at: Interval) -> ThreeStage:
         x, b, d = s.estimates()
-        s = predict(s, propagate((at.k - 1) * plant.dt, x, s.Px, at.u, b, d), known.Q, known.Qb, known.Qd)
-        return s if at.stale is None else s._replace(Px=plus_held_commands(plant, s.Px, x, at))
+        return predict(s, propagate((at.k - 1) * plant.dt, x, s.Px, at.u, b, d), at.noise(known.Q), known.Qb, known.Qd)
 
     def measured(s: ThreeStage, at: Interval, y: Array, seen: Array) -> ThreeStage:
         return update(s, y[:, known.sensors], seen[:, known.sensors], known.H, known.R)

@@ -15,10 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import AugmentedModel, Interval, augmented, plus_held_commands
+from fdi_gym.estimation.augmented import AugmentedModel, augmented
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_labels
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T, masked, right_divide, symmetric, times
 from fdi_gym.plant import Array, Plant
 
@@ -66,8 +67,7 @@ def two_stage_filter(model: AugmentedModel, first_sample: bool = True) -> Filter
         A, E = F[:, rest][:, :, rest], F[:, rest][:, :, zs]
         U = A @ s.V + E
         UPz = U @ s.Pz
-        P = symmetric(A @ s.Px @ T(A) + UPz @ T(U)) + Q
-        P = plus_held_commands(model.plant, P, s.state()[:, model.x], at)
+        P = symmetric(A @ s.Px @ T(A) + UPz @ T(U)) + at.noise(Q)
         aged = s.Pz + Qz
         shrink = np.sqrt(np.minimum(1.0, model.limit[zs] / np.maximum(np.einsum("npp->np", aged), 1e-300)))
         Pz = shrink[:, :, None] * aged * shrink[:, None, :]

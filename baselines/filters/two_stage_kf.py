@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval, plus_held_commands
 from fdi_gym.estimation.calibration import Persistence, uniform
 from fdi_gym.estimation.decision import Reading, Rule, by_candidate, by_labels
 from fdi_gym.estimation.kalman import T, masked, right_divide, symmetric, times
@@ -115,11 +114,6 @@ def predict(s: TwoStage, u: Array, model: LinearModel, Q: Array, Pz_minus: Array
     return s._replace(x=x, Px=Px, Pz=Pz_minus, V=V)
 
 
-def open_state(plant: Plant, s: TwoStage, at: Interval) -> TwoStage:
-    """The state is less sure where the command of the interval did not report."""
-    return s if at.stale is None else s._replace(Px=plus_held_commands(plant, s.Px, s.state(), at))
-
-
 def correct(s: TwoStage, y: Array, seen: Array, C: Array, R: Array) -> TwoStage:
     """With the measurement y_{k+1} of the sensors that reported (n, n_y), eqs. 32 to 41."""
     cross = s.Px @ C.T
@@ -146,7 +140,7 @@ def two_stage_filter(plant: Plant, aged: Callable[[Array], Array]) -> Filter:
     P_x, P_z = initial_covariances(plant)
     return Filter(
         lambda n: start(n, len(plant.outputs), P_x, P_z),
-        lambda s, at: open_state(plant, predict(s, at.u, model, plant.Q, aged(s.Pz)), at),
+        lambda s, at: predict(s, at.u, model, at.noise(plant.Q), aged(s.Pz)),
         lambda s, at, y, seen: correct(s, y, seen, model.C, plant.R),
         read,
         first_sample=False,

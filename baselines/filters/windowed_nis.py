@@ -75,5 +75,5 @@ def windowed_nis(plant: Plant, *, window: int = 50, confidence: float = 0.9999, 
         shown = {"NIS": nis, "limit of the mean": np.full(len(nis), limit / window)}
         return Reading(x=s.x, Px=s.P, nu=s.nu, cost=nis[:, None], signals=shown)
 
-    filter = Filter(start, lambda s, at: (kalman_filter.predict(f, plant, s[0], at), s[1]), update, read, first_sample=False)
+    filter = Filter(start, lambda s, at: (kalman_filter.predict(f, s[0], at), s[1]), update, read, first_sample=False)
     return diagnoser_of(plant, filter, window_rule(m, window, limit, alarm_after))

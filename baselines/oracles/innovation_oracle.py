@@ -20,8 +20,8 @@ from scipy.special import logsumexp
 from baselines.filters import missile_model as model
 from baselines.filters.missile_model import Known
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading, Rule, Verdict
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T, masked, symmetric, times
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant

@@ -15,8 +15,8 @@ from baselines.filters import kalman_filter
 from baselines.filters.bayes_bank import LOG_WEIGHT, Sizes, check, label_probabilities, marginals, most_probable
 from baselines.filters.kalman_filter import Healthy, sense
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.decision import Reading
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant
 
@@ -78,7 +78,7 @@ def known_onset_oracle(
         fresh = begin | ~on
         M, G, g = (np.where(fresh.reshape(-1, *[1] * (a.ndim - 1)), 0.0, a) for a in (s.M, s.G, s.g))
         u_onset = np.where(begin[:, None], at.u, s.u_onset)
-        return s._replace(healthy=kalman_filter.predict(f, plant, s.healthy, at), M=M, G=G, g=g, u_onset=u_onset, on=on)
+        return s._replace(healthy=kalman_filter.predict(f, s.healthy, at), M=M, G=G, g=g, u_onset=u_onset, on=on)
 
     def update(s: Windowed, at: Interval, y: Array, seen: Array) -> Windowed:
         healthy = kalman_filter.correct(f, s.healthy, y, seen)

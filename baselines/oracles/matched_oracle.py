@@ -18,9 +18,9 @@ import scipy.linalg
 from baselines.filters.propagation import trim_model
 from baselines.filters.unknown_inputs import of_all_channels
 from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval
 from fdi_gym.estimation.belief import FaultInputs, fault_inputs
 from fdi_gym.estimation.decision import Reading, Rule, Verdict
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T, masked, right_divide, symmetric, times
 from fdi_gym.estimation.labels import channel_sets, label_of_channels
 from fdi_gym.estimation.linear import linear_output
@@ -71,6 +71,77 @@ class Matched(NamedTuple):
     active: Array  # (n, F) bool: it acted then
 
 
+class Told(NamedTuple):
+    """What the oracle is told of each episode: F faults over K steps."""
+
+    theta: Array  # (n, F, K, n_theta) the fault parameter as each fault alone makes it
+    active: Array  # (n, F, K) bool
+    hold: Array  # (n, F, 4) entry that is stuck in place, step from which on, command, step of the command; -1: none
+
+
+def told_of(plant: Plant, scenarios: Sequence[FaultScenario], count: int) -> Told:
+    """The shapes of up to `count` faults per scenario."""
+    longest = max(s.steps for s in scenarios) + 1
+    theta = np.tile(plant.nominal_theta, (len(scenarios), count, longest, 1))
+    active = np.zeros((len(scenarios), count, longest), bool)
+    hold = np.full((len(scenarios), count, 4), -1)
+    for i, scenario in enumerate(scenarios):
+        for f, fault in enumerate(scenario.faults):
+            table = plant.theta_table(scenario.replace(faults=[fault]))
+            theta[i, f, : len(table.a)] = table.a + table.b
+            active[i, f, fault.onset : fault.end] = True
+            for entry, first, _, command, lag in table.holds:
+                hold[i, f] = entry, first, command, first - lag
+    return Told(theta, active, hold)
+
+
+def errors(plant: Plant, told: Told, s: Matched, at: Interval) -> tuple[Array, Array]:
+    """The error of each fault over the interval (n, F), and where actuators are stuck in place."""
+    k, u = at.k - 1, at.u
+    theta, now = told.theta[s.which, :, k], told.hold[s.which]
+    caught = (now[..., 0] >= 0) & (now[..., 3] == k[:, None])
+    stuck = np.where(caught, np.take_along_axis(u, np.maximum(now[..., 2], 0), axis=1), s.stuck)
+    i, f = np.nonzero((now[..., 0] >= 0) & told.active[s.which, :, k])
+    theta[i, f, now[i, f, 0]] = stuck[i, f]
+    return plant.estimate_target(theta, u[:, None]).sum(axis=2), stuck
+
+
+def energies(G: Array, g: Array, chosen: Array) -> tuple[Array, Array]:
+    """g' G^-1 g and G^-1 g for the signatures chosen (n, r, f) or (r, f); those of faults still to come are zero."""
+    rows = np.arange(len(g))[:, None, None]
+    part, right = G[rows[..., None], chosen[..., :, None], chosen[..., None, :]], g[rows, chosen]
+    size = np.linalg.solve(part + 1e-9 * np.eye(chosen.shape[-1]), right[..., None])[..., 0]
+    return (right * size).sum(axis=-1), size
+
+
+class Found(NamedTuple):
+    """Which channels bring enough energy."""
+
+    on: Array  # (n, p) bool
+    b: Array  # (n, p) the error of each
+    variance: Array  # (n, p)
+
+
+def found_by(s: Matched, choices: Array, threshold: float) -> Found:
+    """The choice of channels (choices, F) that explains most energy, of which each fault must bring its own."""
+    n, F = s.error.shape
+    p = s.g.shape[1] // F
+    columns = choices + p * np.arange(F)
+    on, b, variance = np.zeros((n, p), bool), np.zeros((n, p)), np.zeros((n, p))
+    energy, size = energies(s.G, s.g, columns[None])
+    best, i = np.argmax(energy, axis=1), np.arange(n)
+    for f in range(F):
+        others = np.delete(columns[best], f, axis=1)[:, None]
+        without = energies(s.G, s.g, others)[0][:, 0] if F > 1 else 0.0
+        channel = choices[best, f]
+        found = s.active[:, f] & (energy[i, best] - without > threshold)
+        on[i, channel] |= found
+        b[i, channel] += np.where(found, size[i, best, f] * s.error[:, f], 0.0)
+        own = np.maximum(s.G[i, columns[best, f], columns[best, f]], 1e-9)
+        variance[i, channel] += np.where(found, s.error[:, f] ** 2 / own, 0.0)
+    return Found(on, b, variance)
+
+
 @diagnoser("matched_oracle", "Oracle: onset and shape of the error known, channel and size not", clairvoyant=True)
 def matched_oracle(
     plant: Plant, *, scenarios: Sequence[FaultScenario], threshold: float = 10.83, d_step: float = 0.05
@@ -93,20 +164,9 @@ def matched_oracle(
     p, N, n_x, m = len(inputs.names), len(model.A), len(plant.states), len(model.H)
     count = max(1, *(len(s.faults) for s in scenarios))
     labels, sets = channel_sets(plant, inputs)
-    longest = max(s.steps for s in scenarios) + 1
-    theta_rows = np.tile(plant.nominal_theta, (len(scenarios), count, longest, 1))
-    active = np.zeros((len(scenarios), count, longest), bool)
-    hold = np.full((len(scenarios), count, 4), -1)  # entry, step from which on it is held, command, step of the command
-    for i, scenario in enumerate(scenarios):
-        for f, fault in enumerate(scenario.faults):
-            table = plant.theta_table(scenario.replace(faults=[fault]))
-            theta_rows[i, f, : len(table.a)] = table.a + table.b
-            active[i, f, fault.onset : fault.end] = True
-            for entry, first, _, command, lag in table.holds:
-                hold[i, f] = entry, first, command, first - lag
+    told = told_of(plant, scenarios, count)
     y0, u0 = plant.measure(0.0, plant.trim_state, plant.trim_command), plant.trim_command
     choices = np.array(list(itertools.permutations(range(p), count)))  # the channel of each fault
-    columns = choices + p * np.arange(count)
 
     def start(n: int) -> Matched:
         F = count * p
@@ -115,29 +175,12 @@ def matched_oracle(
             np.zeros((n, F, F)), np.zeros((n, F)), np.zeros((n, count)), np.zeros((n, count), bool),
         )  # fmt: skip
 
-    def errors(s: Matched, at: Interval) -> tuple[Array, Array]:
-        """The error of each fault over the interval (n, F), and where actuators are stuck in place."""
-        k, u = at.k - 1, at.u
-        theta, now = theta_rows[s.which, :, k], hold[s.which]
-        caught = (now[..., 0] >= 0) & (now[..., 3] == k[:, None])
-        stuck = np.where(caught, np.take_along_axis(u, np.maximum(now[..., 2], 0), axis=1), s.stuck)
-        i, f = np.nonzero((now[..., 0] >= 0) & active[s.which, :, k])
-        theta[i, f, now[i, f, 0]] = stuck[i, f]
-        return plant.estimate_target(theta, u[:, None]).sum(axis=2), stuck
-
-    def energies(G: Array, g: Array, chosen: Array) -> tuple[Array, Array]:
-        """g' G^-1 g and G^-1 g for the signatures chosen (n, r, f) or (r, f); those of faults still to come are zero."""
-        rows = np.arange(len(g))[:, None, None]
-        part, right = G[rows[..., None], chosen[..., :, None], chosen[..., None, :]], g[rows, chosen]
-        size = np.linalg.solve(part + 1e-9 * np.eye(chosen.shape[-1]), right[..., None])[..., 0]
-        return (right * size).sum(axis=-1), size
-
     def predict(s: Matched, at: Interval) -> Matched:
-        error, stuck = errors(s, at)
+        error, stuck = errors(plant, told, s, at)
         push = (error[:, :, None, None] * model.Bf.T).reshape(len(error), count * p, N)
         return s._replace(
             x=times(model.A, s.x) + times(model.Bu, at.u - u0), P=symmetric(model.A @ s.P @ model.A.T) + model.Q,
-            stuck=stuck, s=s.s @ model.A.T + push, error=error, active=active[s.which, :, at.k - 1],
+            stuck=stuck, s=s.s @ model.A.T + push, error=error, active=told.active[s.which, :, at.k - 1],
         )  # fmt: skip
 
     def update(s: Matched, at: Interval, y: Array, seen: Array) -> Matched:
@@ -151,22 +194,10 @@ def matched_oracle(
         )  # fmt: skip
 
     def read(s: Matched) -> Reading:
-        n = len(s.x)
-        on, b, variance = np.zeros((n, p), bool), np.zeros((n, p)), np.zeros((n, p))
-        energy, size = energies(s.G, s.g, columns[None])
-        best, i = np.argmax(energy, axis=1), np.arange(n)
-        for f in range(count):
-            others = np.delete(columns[best], f, axis=1)[:, None]
-            without = energies(s.G, s.g, others)[0][:, 0] if count > 1 else 0.0
-            channel = choices[best, f]
-            found = s.active[:, f] & (energy[i, best] - without > threshold)
-            on[i, channel] |= found
-            b[i, channel] += np.where(found, size[i, best, f] * s.error[:, f], 0.0)
-            own = np.maximum(s.G[i, columns[best, f], columns[best, f]], 1e-9)
-            variance[i, channel] += np.where(found, s.error[:, f] ** 2 / own, 0.0)
+        n, found = len(s.x), found_by(s, choices, threshold)
         alone = (s.g**2 / np.maximum(np.einsum("nii->ni", s.G), 1e-12)).reshape(n, count, p).max(axis=1)
-        x = plant.trim_state + s.x[:, :n_x]
-        reading = Reading(b, variance[:, :, None] * np.eye(p), x, s.P[:, :n_x, :n_x], signals={"energy": alone, "on": on})
+        x, P = plant.trim_state + s.x[:, :n_x], found.variance[:, :, None] * np.eye(p)
+        reading = Reading(found.b, P, x, s.P[:, :n_x, :n_x], signals={"energy": alone, "on": found.on})
         return of_all_channels(plant, inputs, reading)
 
     def decide(_: None, k: Array, r: Reading, informed: Array) -> tuple[None, Verdict]:

@@ -13,9 +13,10 @@ import numpy as np
 
 from baselines.filters.augmented_gaussian import Gaussian, gaussian_filter, reading_of
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import Interval, augmented
+from fdi_gym.estimation.augmented import augmented
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.decision import Reading, by_candidate
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.labels import distances, manifolds
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant
@@ -46,7 +47,7 @@ def told_onset_ekf(plant: Plant, belief: Belief, *, scenarios: Sequence[FaultSce
         ValueError (from init): The number of episodes is not that of the scenarios.
     """
     model = augmented(plant, belief, walk=walk)
-    plain, groups, z = gaussian_filter(model, "extended"), manifolds(plant), model.z
+    plain, sets, z = gaussian_filter(model, "extended"), manifolds(plant), model.z
     opened = np.diag(belief.z_size**2)
     extra = PER_FAULT * np.array([len(label.modes) for label in plant.labels])
 
@@ -86,8 +87,8 @@ def told_onset_ekf(plant: Plant, belief: Belief, *, scenarios: Sequence[FaultSce
         cost = np.full((len(s.now), len(plant.labels)), np.inf)
         cost[:, 0] = np.where(s.now, np.inf, 0.0)
         if s.now.any():
-            found = distances(r.z[s.now], r.P[s.now], groups)
-            cost[np.ix_(s.now, found.labels)] = found.J + extra[found.labels]
+            found = distances(r.z[s.now], r.P[s.now], sets)
+            cost[np.ix_(s.now, sets.labels)] = found.J[:, 1:] + extra[sets.labels]
         acts = s.now[:, None]
         return r._replace(z=np.where(acts, r.z, 0.0), P=np.where(acts[..., None], r.P, 0.0), cost=cost)
 

@@ -111,3 +111,10 @@ def map_arrays(function: Callable[..., Any], *nests: Any) -> Any:
 def choose(mask: Array, yes: Any, no: Any) -> Any:
     """The nest whose episodes are those of `yes` where the mask is set, else those of `no`."""
     return map_arrays(lambda a, b: np.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b), yes, no)
+
+
+def among(mask: Array, change: Callable[[], Any], nest: Any) -> Any:
+    """The nest with its episodes changed where the mask is set; what changes none of them is not called."""
+    if mask.all():
+        return change()
+    return choose(mask, change(), nest) if mask.any() else nest

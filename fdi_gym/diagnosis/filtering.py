@@ -3,8 +3,9 @@
 A filter says what it starts from, how it predicts over an interval from the model alone, how it uses the sensors that
 reported, and what it then knows. Counters, gaps, the first sample and the decision are not its business: a sensor that did
 not report arrives as 0 with `seen` False, a command or a known signal that is missing is held, and each episode has its own
-sample number. Of measurements that mean the same (a quaternion and its negative, an angle a turn later) it gets the one
-nearest what it expects.
+sample number. What a held command does to the state is part of the interval's process noise (`Interval.noise`). Of
+measurements that mean the same (a quaternion and its negative, an angle a turn later) it gets the one nearest what it
+expects.
 """
 
 from __future__ import annotations
@@ -14,11 +15,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi_gym.diagnosis.contract import Diagnoser, Diagnosis, choose
-from fdi_gym.estimation.augmented import Interval
+from fdi_gym.diagnosis import compiled
+from fdi_gym.diagnosis.contract import Diagnoser, Diagnosis, among
 from fdi_gym.estimation.decision import Reading, Rule, Verdict
 from fdi_gym.estimation.equivalent import has_equivalents, nearest
-from fdi_gym.plant import Array, Plant
+from fdi_gym.estimation.interval import Interval, held_command_covariance
+from fdi_gym.plant import Array, Plant, contiguous
+
+NO_P, NO_STD = np.zeros((0, 0, 0)), np.zeros((0, 0))
 
 
 class Filter(NamedTuple):
@@ -50,76 +54,93 @@ class Running(NamedTuple):
     rule: Any
 
 
-def _start(plant: Plant, filter: Filter, rule: Rule, n: int) -> Running:
-    known = np.tile([s.nominal for s in plant.known], (n, 1)) if plant.known else np.zeros((n, 0))
-    begun = np.full(n, filter.begin is None)
-    u = np.tile(plant.trim_command, (n, 1))
-    return Running(np.zeros(n, np.int64), begun, u, np.zeros(u.shape), known, filter.start(n), rule.start(n))
+Step = Callable[[Running, Array], tuple[Running, Reading, Verdict]]
 
 
-def _step(plant: Plant, filter: Filter, rule: Rule, s: Running, obs: Array) -> tuple[Running, Reading, Verdict]:
-    y, u, known = plant.split(obs)
-    seen = np.isfinite(y)
-    whole = bool(seen.all())
-    held: Array | None = None
-    stale = s.stale if np.isfinite(u).all() and not s.stale.any() else np.where(np.isfinite(u), 0.0, s.stale + 1.0)
-    if not (np.isfinite(u).all() and np.isfinite(known).all()):
-        held = np.any(~np.isfinite(np.concatenate([u, known], axis=1)), axis=1)
-        u, known = np.where(np.isfinite(u), u, s.u), np.where(np.isfinite(known), known, s.known)
-    if not whole:
-        y = np.where(seen, y, 0.0)
-    first = s.k == 0
-    d = None
-    if plant.measured_disturbance is not None:
-        before = np.where(first[:, None], known, s.known)
-        d = plant.measured_disturbance((s.k - 1) * plant.dt, before, known)  # type: ignore[arg-type]
-    at = Interval(s.k, u, d, known, held, stale if stale.any() else None)
-    state, begun = s.filter, s.begun
-    ready = begun & ~first
-    if ready.all():
-        state = filter.predict(state, at)
-    elif ready.any():
-        state = choose(ready, filter.predict(state, at), state)
-    if filter.expect is not None and has_equivalents(plant):
-        y = nearest(plant, y, seen, filter.expect(state, at))
-    measures = begun if filter.first_sample else ready
-    if filter.begin is not None and not begun.all():
-        needs = seen if filter.needs is None else seen[:, filter.needs]
-        fresh = ~begun & needs.all(axis=1)
-        if fresh.any():
-            state = choose(fresh, filter.begin(state, at, y), state)
-        begun = begun | fresh
-    if measures.all():
-        state = filter.update(state, at, y, seen)
-    elif measures.any():
-        state = choose(measures, filter.update(state, at, y, seen), state)
-    reading = filter.read(state)
-    informed = measures & (seen.any(axis=1) if reading.seen is None else reading.seen > 0)
-    if at.stale is not None:  # what a command that did not report has changed is no evidence of a fault
-        informed &= (at.stale == 0).all(axis=1)
-    ruled, verdict = rule.step(s.rule, s.k, reading, informed)
-    return Running(s.k + 1, begun, u, stale, known, state, ruled), reading, verdict
+def shell(plant: Plant, filter: Filter, rule: Rule) -> tuple[Callable[[int], Running], Step]:
+    """start(n) and step(state, obs (n, n_obs)) -> (state, reading, verdict) of a filter and a rule."""
+    n_y, n_u, n_known = len(plant.outputs), len(plant.commands), len(plant.known)
+    nominal = np.array([s.nominal for s in plant.known], float)
+    turns = filter.expect is not None and has_equivalents(plant)
+
+    def start(n: int) -> Running:
+        u, known, begun = np.tile(plant.trim_command, (n, 1)), np.tile(nominal, (n, 1)), np.full(n, filter.begin is None)
+        return Running(np.zeros(n, np.int64), begun, u, np.zeros(u.shape), known, filter.start(n), rule.start(n))
+
+    def interval(s: Running, u: Array, known: Array, held: Array | None, stale: Array | None) -> Interval:
+        """What is known of the interval that has just ended."""
+        d, Q_held = None, None
+        if plant.measured_disturbance is not None:
+            before = np.where((s.k == 0)[:, None], known, s.known)
+            d = plant.measured_disturbance((s.k - 1) * plant.dt, before, known)  # type: ignore[arg-type]
+        if stale is not None:
+            x = filter.read(s.filter).x
+            Q_held = held_command_covariance(plant, plant.trim_state if x is None else x, s.k, u, d, stale)
+        return Interval(s.k, u, d, known, held, stale, Q_held)
+
+    def moved(s: Running, at: Interval, y: Array, seen: Array) -> tuple[Any, Array, Array]:
+        """The filter's state after the sample, where it has begun, and where the sample was measured."""
+        state, begun, ready = s.filter, s.begun, s.begun & (s.k > 0)
+        state = among(ready, lambda: filter.predict(state, at), state)
+        if turns:
+            y = nearest(plant, y, seen, filter.expect(state, at))  # type: ignore[misc]
+        measures = begun if filter.first_sample else ready
+        if filter.begin is not None and not begun.all():
+            needs = seen if filter.needs is None else seen[:, filter.needs]
+            fresh = ~begun & needs.all(axis=1)
+            state, begun = among(fresh, lambda: filter.begin(state, at, y), state), begun | fresh  # type: ignore[misc]
+        return among(measures, lambda: filter.update(state, at, y, seen), state), begun, measures
+
+    def step(s: Running, obs: Array) -> tuple[Running, Reading, Verdict]:
+        n = len(obs)
+        y, seen, heard, held = np.empty((n, n_y)), np.empty((n, n_y), bool), np.empty(n, bool), np.empty(n, bool)
+        u, stale, known = np.empty((n, n_u)), np.empty((n, n_u)), np.empty((n, n_known))
+        flags = compiled.receive(contiguous(obs), s.k, s.begun, s.u, s.known, s.stale, y, seen, u, known, stale, heard, held)
+        at = interval(s, u, known, held if flags & compiled.HELD else None, stale if flags & compiled.STALE else None)
+        if flags & compiled.RUNNING == compiled.RUNNING:
+            state, begun, measures = filter.predict(s.filter, at), s.begun, None
+            if turns:
+                y = nearest(plant, y, seen, filter.expect(state, at))  # type: ignore[misc]
+            state = filter.update(state, at, y, seen)
+        else:
+            state, begun, measures = moved(s, at, y, seen)
+        reading = filter.read(state)
+        informed = heard if reading.seen is None else reading.seen > 0
+        if measures is not None:
+            informed = informed & measures
+        if at.stale is not None:  # what a command that did not report has changed is no evidence of a fault
+            informed = informed & (at.stale == 0).all(axis=1)
+        ruled, verdict = rule.step(s.rule, s.k, reading, informed)
+        return Running(s.k + 1, begun, u, stale, known, state, ruled), reading, verdict
+
+    return start, step
 
 
 def diagnoser_of(plant: Plant, filter: Filter, rule: Rule) -> Diagnoser:
     """The diagnoser that declares what a rule makes of a filter's readings."""
-    healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
+    start, step = shell(plant, filter, rule)
+    healthy = contiguous(plant.estimate_target(plant.nominal_theta, plant.trim_command))
 
     def update(s: Running, obs: Array) -> tuple[Running, Diagnosis]:
-        s, r, verdict = _step(plant, filter, rule, s, obs)
+        s, r, verdict = step(s, obs)
         z = r.z if verdict.z is None else verdict.z
         P = r.P if verdict.P is None else verdict.P
-        std = None if P is None else np.sqrt(np.maximum(np.einsum("npp->np", P), 0.0))
-        estimate = None if z is None else healthy + z
-        signals = {**(r.signals or {}), **(verdict.signals or {})}
-        return s, Diagnosis(verdict.alarm, verdict.label, estimate, std, r.probs, r.x, signals or None)
+        estimate, std = None, None
+        if z is not None:
+            z = contiguous(z)
+            estimate = np.empty(z.shape)
+            std = None if P is None else np.empty(z.shape)
+            compiled.report(z, NO_P if P is None else contiguous(P), healthy, estimate, NO_STD if std is None else std)
+        signals = {**(r.signals or {}), **(verdict.signals or {})} if r.signals or verdict.signals else None
+        return s, Diagnosis(verdict.alarm, verdict.label, estimate, std, r.probs, r.x, signals)
 
-    return Diagnoser(lambda n: _start(plant, filter, rule, n), update, gaps=True, filter=filter, rule=rule)
+    return Diagnoser(start, update, gaps=True, filter=filter, rule=rule)
 
 
 def readings(plant: Plant, diagnoser: Diagnoser, obs: Array) -> Iterator[tuple[Reading, Verdict]]:
     """What the filter and the rule of a diagnoser say at each sample of recorded observations (N, K + 1, n_obs)."""
-    s = _start(plant, diagnoser.filter, diagnoser.rule, len(obs))
+    start, step = shell(plant, diagnoser.filter, diagnoser.rule)
+    s = start(len(obs))
     for k in range(obs.shape[1]):
-        s, reading, verdict = _step(plant, diagnoser.filter, diagnoser.rule, s, obs[:, k])
+        s, reading, verdict = step(s, obs[:, k])
         yield reading, verdict

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from fdi_gym.diagnosis import compiled
 from fdi_gym.diagnosis.contract import Diagnoser, Diagnosis, choose, map_arrays
 from fdi_gym.plant import Array, Plant, contiguous
 
@@ -13,72 +15,68 @@ LARGE = 1e12  # an estimate beyond it, in units of its scale, has left the numbe
 SUM = 1e-6  # by which probabilities may miss 1
 
 
-def checked(plant: Plant, n: int, diagnosis: Diagnosis) -> Diagnosis:
-    """The diagnosis with its arrays in their declared types.
+Examined = tuple[Diagnosis, Array, bool]
 
-    Raises:
+
+def examiner(plant: Plant) -> Callable[[int, Any], Examined]:
+    """Looks at what a method of this plant says of n episodes.
+
+    It gives the diagnosis with its arrays copied in their declared types, where it holds what cannot be (n,), and whether it
+    does anywhere: such an episode is lost. That is an estimate or a state that is not finite or beyond all bounds, a
+    negative standard deviation, probabilities that are negative, not finite or do not sum to 1.
+
+    Raises (from the function):
         ValueError: A shape or a type that no diagnosis has, or a label that the plant does not have; the field is named.
     """
-    if not isinstance(diagnosis, Diagnosis):
-        raise ValueError(f"update returns (state, Diagnosis), not a {type(diagnosis).__name__}")
-    alarm, label = np.asarray(diagnosis.alarm), np.asarray(diagnosis.label)
-    for name, value, kinds in (("alarm", alarm, "b"), ("label", label, "iu")):
-        if value.shape != (n,) or value.dtype.kind not in kinds:
-            what = "bool" if kinds == "b" else "integer"
-            raise ValueError(f"a diagnosis has {name} of shape {(n,)} and {what}, not {value.shape} of {value.dtype}")
+    most, largest = (LARGE * np.array([s.scale for s in signals]) for signals in (plant.estimated, plant.states))
     labels = len(plant.labels)
-    if ((label < 0) | (label >= labels)).any():
-        wrong = label[(label < 0) | (label >= labels)][0]
-        raise ValueError(f"a diagnosis has labels in 0..{labels - 1}, not {int(wrong)}")
-    widths = {
-        "estimate": len(plant.estimated), "estimate_std": len(plant.estimated), "label_probs": labels,
-        "state": len(plant.states),
-    }  # fmt: skip
-    found: dict[str, Any] = {}
-    for name, width in widths.items():
-        value = getattr(diagnosis, name)
-        if value is None:
-            continue
-        value = np.asarray(value)
-        if value.shape != (n, width) or value.dtype.kind not in "iuf":
-            raise ValueError(
-                f"a diagnosis has {name} of shape {(n, width)} and numbers, or None, not {value.shape} of {value.dtype}"
-            )
-        found[name] = value.astype(float)
-    return diagnosis._replace(alarm=alarm, label=label.astype(np.int64), **found)
+    widths = len(plant.estimated), len(plant.estimated), labels, len(plant.states)
+
+    def examined(n: int, said: Any) -> Examined:
+        if not isinstance(said, Diagnosis):
+            raise ValueError(f"update returns (state, Diagnosis), not a {type(said).__name__}")
+        alarm, label = _copied("alarm", said.alarm, (n,), "b"), _copied("label", said.label, (n,), "iu")
+        estimate, std, probs, state = (
+            None if part is None else _copied(name, part, (n, width), "iuf")
+            for name, part, width in zip(_NUMBERS, said[2:6], widths, strict=True)
+        )
+        wrong, none = np.empty(n, bool), np.empty((n, 0))
+        found = compiled.look(
+            label, labels, none if estimate is None else estimate, none if std is None else std,
+            none if probs is None else probs, none if state is None else state, most, largest, SUM, wrong,
+        )  # fmt: skip
+        if found < 0:
+            unknown = label[(label < 0) | (label >= labels)][0]
+            raise ValueError(f"a diagnosis has labels in 0..{labels - 1}, not {int(unknown)}")
+        return Diagnosis(alarm, label, estimate, std, probs, state, said.signals), wrong, found > 0
+
+    return examined
 
 
-def invalid(plant: Plant, said: Diagnosis) -> Array:
-    """Where a checked diagnosis holds what cannot be (n,): such an episode is lost.
+_NUMBERS = Diagnosis._fields[2:6]
+_TYPES = {"b": (np.bool_, "bool"), "iu": (np.int64, "integer"), "iuf": (np.float64, "numbers, or None")}
 
-    An estimate or a state that is not finite or beyond all bounds, a negative standard deviation, probabilities that are
-    negative, not finite or do not sum to 1.
-    """
-    wrong = np.zeros(len(said.label), bool)
-    for name, signals in (("estimate", plant.estimated), ("state", plant.states)):
-        value = getattr(said, name)
-        if value is not None:
-            bound = LARGE * np.array([s.scale for s in signals])
-            wrong |= ~(np.abs(value) <= bound).all(axis=1)
-    if said.estimate_std is not None:
-        wrong |= (said.estimate_std < 0).any(axis=1)
-    if said.label_probs is not None:
-        total = said.label_probs.sum(axis=1)
-        wrong |= ~((said.label_probs >= -SUM).all(axis=1) & (np.abs(total - 1.0) <= SUM))
-    return wrong
+
+def _copied(name: str, given: Any, shape: tuple[int, ...], kinds: str) -> Array:
+    """A field in its declared type; a copy, so that nobody who is told it reaches into the method's state."""
+    dtype, what = _TYPES[kinds]
+    value = np.array(given, order="C")
+    if value.shape != shape or value.dtype.kind not in kinds:
+        raise ValueError(f"a diagnosis has {name} of shape {shape} and {what}, not {value.shape} of {value.dtype}")
+    return value if value.dtype == dtype else value.astype(dtype)
 
 
 def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
     """The diagnoser as the evaluation runs it.
 
     A method that does not handle gaps is not shown a sample with a missing value: its diagnosis stands. An episode whose
-    diagnosis is `invalid`, or whose update fails in linear algebra, is lost: label -1, which is never right, no alarm,
-    estimate and state NaN, no probability for any label, from there to its end. The other episodes are not touched.
+    diagnosis holds what cannot be (`examiner`), or whose update fails in linear algebra, is lost: label -1, which is never
+    right, no alarm, estimate and state NaN, no probability for any label, from there to its end. The others are not touched.
 
     Raises (from update):
         ValueError: obs has the wrong shape, or the diagnoser's answer does.
     """
-    width = len(plant.observed)
+    width, examined = len(plant.observed), examiner(plant)
 
     def init(n: int) -> Any:
         if n < 0 or isinstance(n, bool):
@@ -121,18 +119,20 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
         shown = ~lost
         if not raw.gaps:
             shown &= np.isfinite(obs).all(axis=1)
-        if not shown.all():
+        whole = bool(shown.all())
+        if not whole:
             obs = np.where(shown[:, None], obs, last_obs)
         with np.errstate(all="ignore"):
             try:
                 after, answer = raw.update(inner, obs)
-                failed = np.zeros(n, bool)
+                failed = None
             except np.linalg.LinAlgError:
                 after, answer, failed = singly(inner, obs)
-        answer = checked(plant, n, answer)
-        failed |= invalid(plant, answer)
-        if failed.any() or not shown.all():
-            fresh = failed & shown
+        answer, wrong, bad = examined(n, answer)
+        if failed is not None:
+            wrong, bad = wrong | failed, True
+        if bad or not whole:
+            fresh = wrong & shown
             lost = lost | fresh
             after = choose(shown & ~lost, after, inner)
             if fresh.any():  # where it stays, out of harm's way; shared counters are those of the episodes that go on

@@ -10,70 +10,18 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy.linalg
 
 from fdi_gym.estimation import gaussian
 from fdi_gym.estimation.belief import Belief, FaultInputs, fault_inputs
-from fdi_gym.estimation.gaussian_model import STEP
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T
 from fdi_gym.plant import Array, Plant
 
-HELD = 10  # samples within which a command that is held goes wrong by its typical size
 WIDEST = 2.0  # the walk never makes a fault's standard deviation larger than this, in units of its typical size
-
-
-class Interval(NamedTuple):
-    """What is known of the interval that ends at a sample, for n episodes."""
-
-    k: Array  # (n,) the sample at its end
-    u: Array  # (n, n_u) the command held over it
-    d: Array | None  # (n, n_d) the measured disturbance; None where none is
-    known: Array  # (n, n_known) what else is known at its end
-    held: Array | None = None  # (n,) bool: a command or known signal did not report, its last value stands; None: all did
-    stale: Array | None = None  # (n, n_u) for how many samples in a row each command has been missing; None: none is
-
-    def of(self, rows: Array) -> Interval:
-        """Of some episodes, each as often as its row is named."""
-        d, held, stale = (None if a is None else a[rows] for a in (self.d, self.held, self.stale))
-        return Interval(self.k[rows], self.u[rows], d, self.known[rows], held, stale)
-
-
-def plus_held_commands(plant: Plant, P: Array, x: Array, at: Interval) -> Array:
-    """A predicted covariance P (n, N, N) whose first entries are the state's, with what a command that was held adds."""
-    more = held_command_covariance(plant, x, at)
-    if more is None:
-        return P
-    P, n_x = P.copy(), x.shape[1]
-    P[:, :n_x, :n_x] += more
-    return P
-
-
-def held_command_covariance(plant: Plant, x: Array, at: Interval) -> Array | None:
-    """What a command that was not reported adds to the covariance of the state (n, n_x, n_x); None where all were.
-
-    The error of a command that is held grows to its typical size within HELD samples, and it is one error, not white noise:
-    over j samples its effects add up, so that the j-th adds 2 j - 1 times its square.
-
-    Args:
-        plant: The plant.
-        x: The state at the interval's start (n, n_x).
-        at: The interval.
-    """
-    if at.stale is None:
-        return None
-    scale = np.array([s.scale for s in plant.commands])
-    points = at.u[:, None] + STEP * np.concatenate([np.diag(scale), -np.diag(scale)])  # (n, 2 n_u, n_u)
-    n, n_u = at.u.shape
-    t = np.repeat((at.k - 1) * plant.dt, 2 * n_u)
-    d = None if at.d is None else np.repeat(at.d, 2 * n_u, axis=0)
-    moved = plant.propagate(t, np.repeat(x, 2 * n_u, axis=0), points.reshape(-1, n_u), None, d).reshape(n, 2 * n_u, -1)
-    B = (moved[:, :n_u] - moved[:, n_u:]) / (2 * STEP)  # (n, n_u, n_x): by a command's typical size
-    weight = np.sqrt(np.maximum(2.0 * at.stale - 1.0, 0.0)) * np.minimum(at.stale / HELD, 1.0)
-    B = weight[..., None] * B
-    return T(B) @ B
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,6 +52,11 @@ class AugmentedModel:
     def rest(self) -> list[int]:
         """The entries of X that are not the fault vector."""
         return [*range(self.x.start, self.x.stop), *range(self.d.start, self.d.stop)]
+
+    @functools.cached_property
+    def hears_all(self) -> bool:
+        """Whether it uses all sensors of the plant, in their order."""
+        return self.sensors.tolist() == list(range(len(self.plant.outputs)))
 
     @functools.cached_property
     def compiled(self) -> gaussian.Model:
@@ -138,20 +91,16 @@ class AugmentedModel:
 
         The interval and the measurement may have fewer rows than X, each for equally many consecutive ones.
         """
-        after, P = gaussian.predict(
-            self.compiled, rule, X, P, (at.k - 1) * self.plant.dt, at.u, at.d, self.Q if self.Q.ndim == 3 else self.Q[None]
-        )
-        if at.stale is None:
-            return after, P
-        at = at.of(np.repeat(np.arange(len(at.k)), len(X) // len(at.k)))
-        return after, plus_held_commands(self.plant, P, X[:, self.x], at)
+        Q = self.Q if self.Q.ndim == 3 else self.Q[None]
+        if at.Q_held is not None:  # each episode has its own, as often as it has rows
+            Q = at.noise(Q, len(X))
+        return gaussian.predict(self.compiled, rule, X, P, (at.k - 1) * self.plant.dt, at.u, at.d, Q)
 
     def update(self, rule: str, X: Array, P: Array, at: Interval, y: Array, seen: Array) -> gaussian.Updated:
         """Update with the measurement y (n, n_y) of the sensors that reported, seen (n, n_y)."""
-        return gaussian.update(
-            self.compiled, rule, X, P, at.k * self.plant.dt, at.u, at.d, y[:, self.sensors], seen[:, self.sensors],
-            self.R[None],
-        )  # fmt: skip
+        if not self.hears_all:
+            y, seen = y.take(self.sensors, axis=1), seen.take(self.sensors, axis=1)
+        return gaussian.update(self.compiled, rule, X, P, at.k * self.plant.dt, at.u, at.d, y, seen, self.R[None])
 
 
 def _linear_sensors(model: AugmentedModel) -> Array | None:

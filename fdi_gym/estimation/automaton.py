@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import boolean, int64, void
 
+from fdi_gym.estimation.compiled import helper
 from fdi_gym.kernels import compiled
 from fdi_gym.plant import Array
 
@@ -29,26 +30,34 @@ class Automaton(NamedTuple):
     last: Array  # the best label of the sample before
 
 
-@compiled(void(I1, I1, I1, I1, I1, I1, B1, B1, int64, int64, int64, boolean, I1, I1, I1, I1, I1))
+@helper
+def advance(label, over, other, under, last, best, over_now, under_now, rise, switch, release, same):
+    """One automaton one sample later: label, over, other, under and last."""
+    on = label > 0
+    again = not same or best == last
+    o = (over + 1 if again else 1) if over_now and not on else 0
+    s = (other + 1 if again else 1) if on and best != label else 0
+    r = under + 1 if on and under_now else 0
+    raised, switched, released = o >= rise, s >= switch, r >= release
+    label = 0 if released else best if raised or switched else label
+    return label, 0 if raised else o, 0 if switched or released else s, 0 if released else r, best
+
+
+@compiled(void(I1, I1, I1, I1, I1, I1, B1, B1, B1, int64, int64, int64, boolean, I1, I1, I1, I1, I1))
 def _step(
-    label, over, other, under, last, best, over_now, under_now, rise, switch, release, same,
+    label, over, other, under, last, best, over_now, under_now, informed, rise, switch, release, same,
     label1, over1, other1, under1, last1,
 ):  # fmt: skip
     n = best.size
     if not n == label.size == over.size == other.size == under.size == last.size == over_now.size == under_now.size:
         raise ValueError("state and evidence need one shape")
+    if informed.size != n:
+        raise ValueError("state and evidence need one shape")
     for i in range(n):
-        on = label[i] > 0
-        again = not same or best[i] == last[i]
-        o = (over[i] + 1 if again else 1) if over_now[i] and not on else 0
-        s = (other[i] + 1 if again else 1) if on and best[i] != label[i] else 0
-        r = under[i] + 1 if on and under_now[i] else 0
-        raised, switched, released = o >= rise, s >= switch, r >= release
-        label1[i] = 0 if released else best[i] if raised or switched else label[i]
-        over1[i] = 0 if raised else o
-        other1[i] = 0 if switched or released else s
-        under1[i] = 0 if released else r
-        last1[i] = best[i]
+        state = label[i], over[i], other[i], under[i], last[i]
+        if informed[i]:
+            state = advance(*state, best[i], over_now[i], under_now[i], rise, switch, release, same)
+        label1[i], over1[i], other1[i], under1[i], last1[i] = state
 
 
 def first(*shape: int) -> Automaton:
@@ -66,6 +75,7 @@ def step(
     switch: int,
     release: int,
     same: bool = False,
+    informed: Array | None = None,
 ) -> Automaton:
     """The automata one sample later.
 
@@ -78,6 +88,7 @@ def step(
         switch: Consecutive samples with another best label that switch to the one of the last of them.
         release: Consecutive samples under that release.
         same: Samples count as consecutive towards a rise or a switch only while the best label is the same.
+        informed: Where the sample says anything (...), bool; elsewhere nothing changes. Default: everywhere.
 
     Raises:
         ValueError: A length below 1, or shapes that differ.
@@ -86,7 +97,7 @@ def step(
     if rise < 1 or switch < 1 or release < 1:
         raise ValueError(f"rise, switch and release are at least one sample, not {rise}, {switch}, {release}")
     out = Automaton(*(np.empty(np.shape(best), np.int64) for _ in Automaton._fields))
-    given = (*state, best, over_now, under_now)
+    given = (*state, best, over_now, under_now, np.ones(np.shape(best), bool) if informed is None else informed)
     if np.ndim(best) == 1:
         try:
             _step(*given, rise, switch, release, same, *out)
@@ -98,12 +109,12 @@ def step(
     return out
 
 
-_NAMES = (*Automaton._fields, "best", "over_now", "under_now")
+_NAMES = (*Automaton._fields, "best", "over_now", "under_now", "informed")
 
 
 def _flat(name: str, given: Array, shape: tuple[int, ...]) -> Array:
     """An array (...) as the kernel takes it (size,)."""
-    a, kind = np.asarray(given), bool if name.endswith("_now") else np.int64
+    a, kind = np.asarray(given), bool if name.endswith("_now") or name == "informed" else np.int64
     if a.shape != shape:
         raise ValueError(f"state and evidence need one shape: {name} has {a.shape}, best {shape}")
     if not np.can_cast(a.dtype, kind, "same_kind"):

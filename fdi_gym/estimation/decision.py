@@ -22,12 +22,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fdi_gym.estimation import label_kernels
 from fdi_gym.estimation.automaton import Automaton, first, step
 from fdi_gym.estimation.belief import FaultInputs, noisy_sensors
-from fdi_gym.estimation.calibration import LEAST, Calibration, Persistence, gain
+from fdi_gym.estimation.calibration import LEAST, Calibration, Persistence
 from fdi_gym.estimation.kalman import quadratic
 from fdi_gym.estimation.labels import channel_sets, distances, label_of_channels, manifolds
-from fdi_gym.plant import Array, Plant
+from fdi_gym.plant import Array, Plant, contiguous
 
 
 class Reading(NamedTuple):
@@ -92,10 +93,9 @@ def declare(s: Automaton, best: Array, over: Array, under: Array, after: Persist
         after: How many samples in a row that takes. A release wins over a switch.
         informed: Where the sample says anything; elsewhere nothing changes.
     """
-    found = step(s, best, over, under, rise=after.rise, switch=after.switch, release=after.release, same=after.same)
-    if informed.all():
-        return found
-    return Automaton(*(np.where(informed, new, old) for new, old in zip(found, s, strict=True)))
+    return step(
+        s, best, over, under, rise=after.rise, switch=after.switch, release=after.release, same=after.same, informed=informed
+    )
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -191,42 +191,41 @@ def by_labels(
         raise ValueError(f"unknown decision {decision!r}; there are {', '.join(DECISIONS)}")
     if decision == "thresholds" and size is None:
         raise ValueError("the decision 'thresholds' needs the typical fault sizes")
-    groups, penalty, after = manifolds(plant), calibration.penalties(plant), calibration.persistence
+    sets, penalty, after = manifolds(plant), calibration.penalties(plant), calibration.persistence
     statistic = STATISTICS[decision]() if decision in STATISTICS else None
     fixed = np.diag((QUARTER * size) ** 2 / LEAST)[None] if decision == "thresholds" and size is not None else None
     m, p = len(plant.outputs), len(plant.estimated)
-    excess = np.zeros((p, p)) if calibration.excess is None else calibration.excess
+    excess = np.zeros((p, p)) if calibration.excess is None or fixed is not None else contiguous(calibration.excess)
+    limit = np.inf if calibration.rise is None else calibration.rise
+    where = np.concatenate([[0], sets.labels])
+    in_order, back = bool((where == np.arange(len(where))).all()), np.argsort(where)
+    lengths = after.rise, after.switch, after.release, after.same
+    none = np.zeros(0)
 
     def start(n: int) -> Any:
         return undeclared(n), None
 
     def step(state: Any, k: Array, r: Reading, informed: Array) -> tuple[Any, Verdict]:
         declared, tested = state
-        cost, found = r.cost, None
+        cost, found, rise = r.cost, None, None
         if cost is None:
             assert r.z is not None
             assert r.P is not None
-            found = distances(r.z, r.P + excess if fixed is None else fixed, groups)
-            cost = np.empty((len(r.z), len(plant.labels)))
-            cost[:, 0], cost[:, found.labels] = found.J_healthy, found.J
-        share = gain(cost, penalty)
-        informed = informed & (k > after.warmup)
-        rise = None
-        over: Array = share > 1.0
+            found = distances(r.z, r.P if fixed is None else fixed, sets, excess)
+            cost = found.J if in_order else found.J[:, back]
         if statistic is not None:
             tested = statistic.start(len(cost), r.nu.shape[1] if r.nu is not None else m) if tested is None else tested
-            tested, rise = statistic.step(tested, r, informed)
-            over = rise > (np.inf if calibration.rise is None else calibration.rise)
-        if after.same:  # health is a label like the others
-            best = np.argmin(cost + penalty, axis=1)
-            over, under = best > 0, np.zeros(len(best), bool)
-        else:
-            best, under = 1 + np.argmin(cost[:, 1:] + penalty[1:], axis=1), share < 0.5
-        declared = declare(declared, best, over, under, after, informed)
+            tested, rise = statistic.step(tested, r, informed & (k > after.warmup))
+        n = len(cost)
+        following, alarm = Automaton(*np.empty((5, n), np.int64)), np.empty(n, bool)
+        label_kernels.declare(
+            contiguous(cost), penalty, none if rise is None else rise, limit, k, after.warmup, informed, *declared, *lengths,
+            *following, alarm,
+        )  # fmt: skip
         z = None
         if on_line and found is not None:
-            z = (found.deviation * (found.labels == declared.label[:, None])[..., None]).sum(axis=1)
-        return (declared, tested), Verdict(declared.label > 0, declared.label, z, Evidence(cost, rise))
+            z = (sets.points(found.m) * (sets.labels == following.label[:, None])[..., None]).sum(axis=1)
+        return (following, tested), Verdict(alarm, following.label, z, Evidence(cost, rise))
 
     return Rule(start, step)
 

@@ -27,7 +27,7 @@ import numpy as np
 from fdi_gym.estimation import gaussian_kernels as kernels
 from fdi_gym.estimation.gaussian_model import Model, bind
 from fdi_gym.estimation.gaussian_moments import CENTRAL_DIFFERENCE, EXTENDED, UNSCENTED
-from fdi_gym.plant import Array
+from fdi_gym.plant import Array, contiguous
 
 __all__ = [
     "RULES", "Corrected", "Model", "Updated", "bind", "correct", "f", "h", "jacobian_f", "jacobian_h", "predict", "update",
@@ -45,6 +45,7 @@ class Updated(NamedTuple):
     S: Array  # (n, m, m) its covariance
     nis: Array  # (n,) nu' S^-1 nu, chi-square with as many degrees of freedom as sensors were seen
     log_likelihood: Array  # (n,) log density of what was seen, its 2 pi terms included; 0 where nothing was
+    count: Array  # (n,) int: sensors that were seen
 
 
 class Corrected(NamedTuple):
@@ -67,12 +68,11 @@ def _rule(name: str) -> int:
 
 def _call(kernel: Any, head: tuple[Any, ...], *arrays: Any) -> None:
     """Call a kernel with the arrays in the order and type that it takes; a copy only of what is not so, or read-only."""
-    plain = [np.ascontiguousarray(a, float) for a in arrays]
     try:
-        kernel(*head, *plain)
+        kernel(*head, *arrays)
     except TypeError:
-        plain = [a if a.flags.writeable else a.copy() for a in plain]
-        head = tuple(a.copy() if isinstance(a, np.ndarray) and not a.flags.writeable else a for a in head)
+        plain = [contiguous(a) for a in arrays]
+        head = tuple(np.require(a, requirements="CW") if isinstance(a, np.ndarray) else a for a in head)
         try:
             kernel(*head, *plain)
         except TypeError:
@@ -164,13 +164,13 @@ def update(
     """
     n, m = len(X), model.m
     X1, P1, nu, S = np.empty(X.shape), np.empty(P.shape), np.empty((n, m)), np.empty((n, m, m))
-    nis, log = np.empty(n), np.empty(n)
+    nis, log, count = np.empty(n), np.empty(n), np.empty(n, np.int64)
     known = model.unmeasured if d is None else d
     _call(
-        kernels.update, (_rule(rule), *model.constants, model.H, np.ascontiguousarray(seen)), X, P, t, u, known, y, R,
+        kernels.update, (_rule(rule), *model.constants, model.H, seen, count), X, P, t, u, known, y, R,
         X1, P1, nu, S, nis, log,
     )  # fmt: skip
-    return Updated(X1, P1, nu, S, nis, log)
+    return Updated(X1, P1, nu, S, nis, log, count)
 
 
 def correct(X: Array, P: Array, mean: Array, cross: Array, S: Array, y: Array, seen: Array) -> Corrected:
@@ -191,5 +191,5 @@ def correct(X: Array, P: Array, mean: Array, cross: Array, S: Array, y: Array, s
     n, m = mean.shape
     X1, P1, K = np.empty(X.shape), np.empty(P.shape), np.empty((n, X.shape[1], m))
     nu, S1, nis, log = np.empty((n, m)), np.empty((n, m, m)), np.empty(n), np.empty(n)
-    _call(kernels.correct, (np.ascontiguousarray(seen),), X, P, y, mean, cross, S, X1, P1, nu, S1, K, nis, log)
+    _call(kernels.correct, (seen,), X, P, y, mean, cross, S, X1, P1, nu, S1, K, nis, log)
     return Corrected(X1, P1, nu, S1, nis, log, K)

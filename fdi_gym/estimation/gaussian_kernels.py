@@ -86,8 +86,10 @@ def predict(rule, integers, reals, step, offset, direction, limit, plant, X, P, 
                     P1[e, j, i] *= shrink
 
 
-@compiled(void(int64, *MODEL, M, B2, M, M3, V, M, M, M, M3, M, M3, M, M3, V, V))
-def update(rule, integers, reals, step, offset, direction, H, seen, X, P, t, u, known, y, R, X1, P1, nu, S, distance, log):
+@compiled(void(int64, *MODEL, M, B2, I1, M, M3, V, M, M, M, M3, M, M3, M, M3, V, V))
+def update(
+    rule, integers, reals, step, offset, direction, H, seen, count, X, P, t, u, known, y, R, X1, P1, nu, S, distance, log
+):
     """X1 and P1 after the sensors y (n, m) at t, of which `seen` reported."""
     (n, N), m = X.shape, integers[10]
     if n == 0:
@@ -112,8 +114,9 @@ def update(rule, integers, reals, step, offset, direction, H, seen, X, P, t, u, 
             through(
                 rule, False, integers, reals, step, offset[line], direction[line], te, X[e], P[e], ue, de, mean, cross, cov
             )
-        Re = R[e % R.shape[0]]
+        Re, count[e] = R[e % R.shape[0]], 0
         for a in range(m):
+            count[e] += reported[a]
             for b in range(m):
                 cov[a, b] += Re[a, b]
         distance[e], log[e] = correct_episode(

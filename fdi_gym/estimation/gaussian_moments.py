@@ -120,67 +120,91 @@ def factor(P, U):
 
 
 @helper
-def through(rule, moving, integers, reals, step, offset, direction, t, X, P, u, known, mean, cross, cov):
-    """N(X, P) through f (moving) or h: mean (m,), cov (m, m) and cross (m, N) with what went in."""
-    N, m, low = X.size, mean.size, 0
-    points, values, first = np.empty((2 * N + 1, N)), np.empty((2 * N + 1, m)), np.empty((N, m))
-    h2 = N + 2.0 if rule == UNSCENTED else 3.0
-    h = np.sqrt(h2)
-    if rule == EXTENDED:
-        U = np.zeros((N, N))
-        for j in range(N):
-            U[j, j] = step[j]
-        h = 1.0
-    else:
-        U = np.empty((N, N))
-        factor(P, U)
-        low = integers[4] if moving else 0  # of f, nobody asks for the covariance with x before
+def squared_step(rule, N):
+    """h^2 of the rules with points along the columns of a factor of P."""
+    return N + 2.0 if rule == UNSCENTED else 3.0
+
+
+@helper
+def spread(X, U, h, points):
+    """The points (2 N + 1, N): X, and X plus and minus h times each row of the upper triangle U."""
+    N = X.size
     for i in range(N):
         points[0, i] = X[i]
     for j in range(N):
         for i in range(N):
-            offset_i = h * U[j, i] if i >= j else 0.0
-            points[1 + j, i] = X[i] + offset_i
-            points[1 + N + j, i] = X[i] - offset_i
-    pass_points(moving, integers, reals, offset, direction, t, points, u, known, values)
+            offset = h * U[j, i] if i >= j else 0.0
+            points[1 + j, i] = X[i] + offset
+            points[1 + N + j, i] = X[i] - offset
+
+
+@helper
+def moments_of_points(rule, U, low, values, first, mean, cross, cov):
+    """Mean (m,), cov (m, m) and cross (m, N) from `low` on of the values (2 N + 1, m) at points that a factor has spread.
+
+    Into values[1 : N + 1] go the second differences, into first (N, m) the halved first ones.
+    """
+    (N, m), h2 = first.shape, squared_step(rule, first.shape[0])
+    half, weight = 0.5 / np.sqrt(h2), 1.0 / (4.0 * h2) if rule == UNSCENTED else (h2 - 1.0) / (4.0 * h2 * h2)
     for a in range(m):
         mean[a] = 0.0
         for i in range(N):
             cross[a, i] = 0.0
         for b in range(m):
             cov[a, b] = 0.0
+    second = values[1 : N + 1]
     for j in range(N):
-        half = 0.5 / step[j] if rule == EXTENDED else 0.5 / h
         for a in range(m):
             first[j, a] = (values[1 + j, a] - values[1 + N + j, a]) * half
-    if rule == EXTENDED:
-        for a in range(m):
-            for j in range(N):
-                for i in range(N):
-                    cross[a, i] += first[j, a] * P[j, i]
-            for i in range(N):
-                for b in range(a + 1):
-                    cov[a, b] += cross[a, i] * first[i, b]
-    else:
-        second = values[1 : N + 1]
+            second[j, a] = values[1 + j, a] + values[1 + N + j, a] - 2.0 * values[0, a]
+            mean[a] += second[j, a]
+    for a in range(m):
+        mean[a] /= 2.0 * h2
         for j in range(N):
-            for a in range(m):
-                second[j, a] = values[1 + j, a] + values[1 + N + j, a] - 2.0 * values[0, a]
-                mean[a] += second[j, a]
-        weight = 1.0 / (4.0 * h2) if rule == UNSCENTED else (h2 - 1.0) / (4.0 * h2 * h2)
-        for a in range(m):
-            mean[a] /= 2.0 * h2
-            for j in range(N):
-                for i in range(max(j, low), N):
-                    cross[a, i] += first[j, a] * U[j, i]
-                weighed = weight * second[j, a]
-                for b in range(a + 1):
-                    cov[a, b] += first[j, a] * first[j, b] + weighed * second[j, b]
-            if rule == UNSCENTED:
-                for b in range(a + 1):
-                    cov[a, b] -= mean[a] * mean[b]
+            for i in range(max(j, low), N):
+                cross[a, i] += first[j, a] * U[j, i]
+            weighed = weight * second[j, a]
+            for b in range(a + 1):
+                cov[a, b] += first[j, a] * first[j, b] + weighed * second[j, b]
+        if rule == UNSCENTED:
+            for b in range(a + 1):
+                cov[a, b] -= mean[a] * mean[b]
     for a in range(m):
         mean[a] += values[0, a]
+        for b in range(a):
+            cov[b, a] = cov[a, b]
+
+
+@helper
+def through(rule, moving, integers, reals, step, offset, direction, t, X, P, u, known, mean, cross, cov):
+    """N(X, P) through f (moving) or h: mean (m,), cov (m, m) and cross (m, N) with what went in."""
+    N, m = X.size, mean.size
+    points, values, first = np.empty((2 * N + 1, N)), np.empty((2 * N + 1, m)), np.empty((N, m))
+    if rule != EXTENDED:
+        U = np.empty((N, N))
+        factor(P, U)
+        spread(X, U, np.sqrt(squared_step(rule, N)), points)
+        pass_points(moving, integers, reals, offset, direction, t, points, u, known, values)
+        low = integers[4] if moving else 0  # of f, nobody asks for the covariance with x before
+        moments_of_points(rule, U, low, values, first, mean, cross, cov)
+        return
+    spread(X, np.diag(step), 1.0, points)
+    pass_points(moving, integers, reals, offset, direction, t, points, u, known, values)
+    for j in range(N):
+        for a in range(m):
+            first[j, a] = (values[1 + j, a] - values[1 + N + j, a]) * (0.5 / step[j])
+    for a in range(m):
+        mean[a] = values[0, a]
+        for i in range(N):
+            cross[a, i] = 0.0
+        for j in range(N):
+            for i in range(N):
+                cross[a, i] += first[j, a] * P[j, i]
+        for b in range(a + 1):
+            cov[a, b] = 0.0
+        for i in range(N):
+            for b in range(a + 1):
+                cov[a, b] += cross[a, i] * first[i, b]
         for b in range(a):
             cov[b, a] = cov[a, b]
 

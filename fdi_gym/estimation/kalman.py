@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi_gym.estimation import gaussian
+from fdi_gym.estimation import compiled, gaussian
 from fdi_gym.plant import Array, contiguous
 
 
@@ -27,8 +27,6 @@ def symmetric(P: Array) -> Array:
 
 def solve(S: Array, M: Array) -> Array:
     """S^-1 M for stacks of small matrices: S (..., m, m), M (..., m, r). Not finite where S is singular."""
-    from fdi_gym.estimation import compiled
-
     outer = S.shape[:-2] if S.shape[:-2] == M.shape[:-2] else np.broadcast_shapes(S.shape[:-2], M.shape[:-2])
     left, right = (contiguous(a if a.shape[:-2] == outer else np.broadcast_to(a, (*outer, *a.shape[-2:]))) for a in (S, M))
     out = np.empty(right.shape)

@@ -10,37 +10,43 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fdi_gym.estimation import label_kernels
 from fdi_gym.estimation.belief import FaultInputs
-from fdi_gym.plant import Array, FaultMode, Plant, contiguous
+from fdi_gym.plant import Array, Plant, contiguous
 
 
 class Manifolds(NamedTuple):
-    """The sets that labels of f simultaneous faults span in the estimated space: offset + directions m, low <= m <= high."""
+    """The sets that the faulty labels span in the estimated space: offset + direction m, low <= m <= high.
+
+    They have up to f simultaneous faults; what is beyond a label's own number is 0.
+    """
 
     labels: Array  # (h,) label indices
+    faults: Array  # (h,) simultaneous faults of each
     offset: Array  # (h, p)
     direction: Array  # (h, p, f)
     low: Array  # (h, f)
     high: Array  # (h, f)
 
+    def points(self, m: Array) -> Array:
+        """The points of the magnitudes m (..., h, f): (..., h, p)."""
+        return self.offset + (self.direction @ m[..., None])[..., 0]
 
-def manifolds(plant: Plant) -> list[Manifolds]:
-    """The faulty labels of a plant as sets, from the lines of their modes, grouped by the number of faults."""
+
+def manifolds(plant: Plant) -> Manifolds:
+    """The faulty labels of a plant as sets, from the lines of their modes, those with fewer faults first."""
     modes = {mode.name: mode for mode in plant.modes}
-    groups: dict[int, list[tuple[int, list[FaultMode]]]] = {}
-    for index, label in enumerate(plant.labels):
-        if label.modes:
-            groups.setdefault(len(label.modes), []).append((index, [modes[name] for name in sorted(label.modes)]))
-    return [
-        Manifolds(
-            np.array([index for index, _ in group]),
-            np.array([np.sum([line.offset for line in lines], axis=0) for _, lines in group]),
-            np.array([np.transpose([line.direction for line in lines]) for _, lines in group]),
-            np.array([[line.reach[0] for line in lines] for _, lines in group]),
-            np.array([[line.reach[1] for line in lines] for _, lines in group]),
-        )
-        for _, group in sorted(groups.items())
-    ]
+    faulty = sorted((i for i, label in enumerate(plant.labels) if label.modes), key=lambda i: len(plant.labels[i].modes))
+    faults = np.array([len(plant.labels[i].modes) for i in faulty], np.int64)
+    h, p, f = len(faulty), len(plant.estimated), int(faults.max(initial=0))
+    offset, direction, low, high = np.zeros((h, p)), np.zeros((h, p, f)), np.zeros((h, f)), np.zeros((h, f))
+    for row, index in enumerate(faulty):
+        for column, name in enumerate(sorted(plant.labels[index].modes)):
+            line = modes[name]
+            offset[row] += line.offset
+            direction[row, :, column] = line.direction
+            low[row, column], high[row, column] = line.reach
+    return Manifolds(np.array(faulty, np.int64), faults, offset, direction, low, high)
 
 
 def nearest_of(I: Array, Iz: Array, sets: Manifolds) -> tuple[Array, Array]:  # noqa: E741
@@ -48,49 +54,33 @@ def nearest_of(I: Array, Iz: Array, sets: Manifolds) -> tuple[Array, Array]:  # 
 
     I (n or 1, p, p) information about the deviation from healthy, Iz (n, p) what it says. Returns (n, h) and m (n, h, f).
     """
-    from fdi_gym.estimation import compiled
-
-    D, offset = sets.direction, sets.offset
-    Io = (I @ offset.T).swapaxes(1, 2)  # (n, h, p)
-    base = (Io * offset).sum(axis=2) - 2 * Iz @ offset.T
-    g = ((Iz[:, None, :] - Io)[:, :, None, :] @ D)[:, :, 0, :]  # (n, h, f)
-    G = np.swapaxes(D, 1, 2) @ I[:, None] @ D  # (n, h, f, f)
-    G = G if len(G) == len(g) else np.repeat(G, len(g), axis=0)  # the kernel does not repeat the only row of I
-    m, value = np.zeros_like(g), np.empty_like(base)
-    compiled.box_minimum(*(contiguous(a) for a in (G, g, sets.low, sets.high)), m, value)
-    return base + value, m
-
-
-def closest(z: Array, I: Array, sets: Manifolds) -> tuple[Array, Array]:  # noqa: E741
-    """Distance of each estimate to each set: min over m in its box of (z - offset - D m)' I (z - offset - D m).
-
-    z (n, p), I = P^-1 (n, p, p). Returns (J (n, h), m (n, h, f)).
-    """
-    Iz = (I @ z[..., None])[..., 0]
-    value, m = nearest_of(I, Iz, sets)
-    return (Iz * z).sum(axis=1)[:, None] + value, m
+    n, (h, _, f) = len(Iz), sets.direction.shape
+    value, m = np.empty((n, h)), np.empty((n, h, f))
+    label_kernels.nearest(contiguous(I), contiguous(Iz), *sets[1:], value, m)
+    return value, m
 
 
 class Distances(NamedTuple):
-    """The faulty labels ranked by distance, over all groups."""
+    """Squared distances of estimates to healthy and to the faulty labels."""
 
-    labels: Array  # (h,)
-    J: Array  # (n, h)
-    J_healthy: Array  # (n,)
-    deviation: Array  # (n, h, p) the closest point of each label's set
+    J: Array  # (n, 1 + h) to healthy, and to the sets in their order
+    m: Array  # (n, h, f) magnitudes of the closest point of each set
 
 
-def distances(z: Array, P: Array, groups: list[Manifolds]) -> Distances:
-    """Distances of the estimate to healthy and to every faulty label, in the metric of its covariance."""
-    I = np.linalg.inv(P)  # noqa: E741 (the metric itself is needed: it weighs many residuals)
-    parts = [closest(z, I, sets) for sets in groups]
-    points = [sets.offset + (sets.direction @ m[..., None])[..., 0] for sets, (_, m) in zip(groups, parts, strict=True)]
-    return Distances(
-        np.concatenate([sets.labels for sets in groups]),
-        np.concatenate([J for J, _ in parts], axis=1),
-        (z[:, None, :] @ I @ z[:, :, None])[:, 0, 0],
-        np.concatenate(points, axis=1),
-    )
+def distances(z: Array, P: Array, sets: Manifolds, excess: Array | None = None) -> Distances:
+    """Distances of the estimate to healthy and to every faulty label, in the metric of its covariance.
+
+    Args:
+        z: Deviation from healthy (n, p).
+        P: Its covariance, (n, p, p) or (1, p, p) for all.
+        sets: The labels.
+        excess: What the covariance lacks (p, p). Default: nothing.
+    """
+    n, (h, p, f) = len(z), sets.direction.shape
+    J, m = np.empty((n, 1 + h)), np.empty((n, h, f))
+    nothing = np.zeros((p, p)) if excess is None else excess
+    label_kernels.distances(contiguous(z), contiguous(P), nothing, *sets[1:], J, m)
+    return Distances(J, m)
 
 
 # ------------------------------------------------------------------------------------------

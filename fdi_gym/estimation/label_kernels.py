@@ -1,0 +1,123 @@
+"""The kernels of `labels`: how far each estimate of a batch is from each label's set, and which label fits best."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import boolean, float64, int64, void
+
+from fdi_gym.estimation.automaton import advance
+from fdi_gym.estimation.compiled import box_minimum, eliminate, helper
+from fdi_gym.kernels import M, V, compiled
+
+I1, B1, M3 = int64[::1], boolean[::1], float64[:, :, ::1]
+SETS = (I1, M, M3, M, M)  # faults, offset, direction, low, high: of the sets, as in `labels.Manifolds`
+
+
+@helper
+def nearest_points(I, Iz, faults, offset, direction, low, high, value, m):  # noqa: E741 (the information)
+    """value[s] = min of q' I q - 2 q' Iz over q = offset[s] + direction[s] m[s] with m[s] in its box, for all sets s."""
+    sets, p, most = direction.shape
+    G, g, ID, Io = np.empty((most, most)), np.empty(most), np.empty((most, p)), np.empty(p)
+    a, at, where, tried = np.empty((most, most + 1)), np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
+    for s in range(sets):
+        f = faults[s]
+        base = 0.0
+        for i in range(p):
+            Io[i] = 0.0
+            for j in range(p):
+                Io[i] += I[i, j] * offset[s, j]
+            base += offset[s, i] * (Io[i] - 2.0 * Iz[i])
+        for r in range(f):
+            g[r] = 0.0
+            for i in range(p):
+                g[r] += direction[s, i, r] * (Iz[i] - Io[i])
+                ID[r, i] = 0.0
+                for j in range(p):
+                    ID[r, i] += I[i, j] * direction[s, j, r]
+            for c in range(r + 1):
+                G[r, c] = 0.0
+                for i in range(p):
+                    G[r, c] += ID[r, i] * direction[s, i, c]
+                G[c, r] = G[r, c]
+        for r in range(f, most):
+            m[s, r] = 0.0
+        value[s] = base + box_minimum(G, g, low[s], high[s], f, a, at, where, tried, m[s])
+
+
+@compiled(void(M3, M, *SETS, M, M3))
+def nearest(I, Iz, faults, offset, direction, low, high, value, m):  # noqa: E741
+    """value (n, sets) and m (n, sets, f) of `nearest_points` for I (n or 1, p, p) and Iz (n, p)."""
+    for e in range(len(Iz)):
+        nearest_points(I[e % len(I)], Iz[e], faults, offset, direction, low, high, value[e], m[e])
+
+
+@compiled(void(M, M3, M, *SETS, M, M3))
+def distances(z, P, excess, faults, offset, direction, low, high, J, m):
+    """J (n, 1 + sets): squared distances of z (n, p) to healthy and each set in the metric of P (n or 1, p, p) + excess."""
+    n, p = z.shape
+    a, I, Iz = np.empty((p, p)), np.empty((p, p)), np.empty(p)  # noqa: E741
+    for e in range(n):
+        if e < len(P):
+            for i in range(p):
+                for j in range(p):
+                    a[i, j] = P[e, i, j] + excess[i, j]
+                    I[i, j] = 1.0 if i == j else 0.0
+            eliminate(a, I)
+        healthy = 0.0
+        for i in range(p):
+            Iz[i] = 0.0
+            for j in range(p):
+                Iz[i] += I[i, j] * z[e, j]
+            healthy += z[e, i] * Iz[i]
+        J[e, 0] = healthy
+        nearest_points(I, Iz, faults, offset, direction, low, high, J[e, 1:], m[e])
+        for s in range(len(faults)):
+            J[e, 1 + s] += healthy
+
+
+@helper
+def lowest(values, penalty, first):
+    """Position of the first least values + penalty from `first` on; that of one that is no number, where there is one."""
+    best = first
+    for i in range(first, len(values)):
+        value, least = values[i] + penalty[i], values[best] + penalty[best]
+        if value != value:
+            return i
+        if value < least:
+            best = i
+    return best
+
+
+@helper
+def gain(cost, penalty):
+    """The gain in fit over healthy of the best faulty label, as a share of what it must be; no number if one is none."""
+    share = -np.inf
+    for i in range(1, len(cost)):
+        value = (cost[0] - cost[i]) / penalty[i]
+        if value != value:
+            return value
+        share = max(share, value)
+    return share
+
+
+@compiled(void(M, V, V, float64, I1, int64, B1, I1, I1, I1, I1, I1, int64, int64, int64, boolean, I1, I1, I1, I1, I1, B1))
+def declare(
+    cost, penalty, statistic, limit, k, warmup, informed, label, over, other, under, last, rise, switch, release, same,
+    label1, over1, other1, under1, last1, alarm,
+):  # fmt: skip
+    """The automata one sample later, and whether they alarm, from the costs (n, labels) and what each label must gain.
+
+    The statistic (n,), where there is one, takes the place of the costs in raising an alarm.
+    """
+    for e in range(len(cost)):
+        state = label[e], over[e], other[e], under[e], last[e]
+        if informed[e] and k[e] > warmup:
+            if same:  # health is a label like the others
+                best = lowest(cost[e], penalty, 0)
+                above, below = best > 0, False
+            else:
+                best, share = lowest(cost[e], penalty, 1), gain(cost[e], penalty)
+                above, below = statistic[e] > limit if statistic.size else share > 1.0, share < 0.5
+            state = advance(*state, best, above, below, rise, switch, release, same)
+        label1[e], over1[e], other1[e], under1[e], last1[e] = state
+        alarm[e] = state[0] > 0
