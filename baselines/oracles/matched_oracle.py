@@ -71,7 +71,12 @@ class Matched(NamedTuple):
     active: Array  # (n, F) bool: it acted then
 
 
-@diagnoser("matched_oracle", "Oracle: onset and shape of the error known, channel and size not", clairvoyant=True)
+@diagnoser(
+    "matched_oracle",
+    "Matched filters of the known errors of commands, channel and size not known",
+    knows="when each fault begins and ends, and its error's shape",
+    ceiling=True,
+)
 def matched_oracle(
     plant: Plant, *, scenarios: Sequence[FaultScenario], threshold: float = 10.83, d_step: float = 0.05
 ) -> Diagnoser:

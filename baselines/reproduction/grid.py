@@ -17,9 +17,10 @@ from baselines.reproduction.tables import markdown, pieces
 from fdi_gym.diagnosis import diagnosers
 from fdi_gym.evaluation import applicable, evaluate
 from fdi_gym.files import pretty, read_json, write_whole
-from fdi_gym.leaderboard import clairvoyant, plain, read_rows
+from fdi_gym.leaderboard import read_rows
 from fdi_gym.row import Row, row_path, write_rows
 from fdi_gym.suite import Suite, load_suite
+from fdi_gym.tables import clairvoyant, plain
 
 KINDS = ("standard", "hard")
 # the filters of the paper that each plant was taken from

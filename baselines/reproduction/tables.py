@@ -12,7 +12,7 @@ import msgspec
 from tqdm import tqdm
 
 from fdi_gym.files import RefusedError, read_json, write_whole
-from fdi_gym.leaderboard import markdown
+from fdi_gym.tables import markdown
 
 __all__ = ["compared", "markdown", "pieces"]
 

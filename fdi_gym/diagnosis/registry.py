@@ -45,7 +45,13 @@ class Entry(NamedTuple):
     summary: str
     build: Callable[..., Diagnoser]
     settings: Mapping[str, Any]  # that belong to the name
-    clairvoyant: bool
+    knows: str  # of the truth, in words; empty for a method that is told nothing
+    ceiling: bool  # what it knows is more than any method can find out: it frames a table
+
+    @property
+    def clairvoyant(self) -> bool:
+        """Whether it knows a part of the truth."""
+        return bool(self.knows)
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -110,18 +116,22 @@ def paper_tuning(entry: Entry, plant: Plant, asked: Mapping[str, Any]) -> dict[s
 _entries: dict[str, Entry] = {}
 
 
-def diagnoser(name: str, summary: str, *, clairvoyant: bool = False, **settings: Any) -> Callable[[Any], Any]:
+def diagnoser(name: str, summary: str, *, knows: str = "", ceiling: bool = False, **settings: Any) -> Callable[[Any], Any]:
     """Make a builder known under a name. Stacked, it gives one builder several names with different settings.
 
     Args:
         name: As users and tables call it.
         summary: One line for tables.
-        clairvoyant: The builder takes `scenarios=`, one per episode, and its row says that it knows the truth.
+        knows: What it is told of the truth, in a few words for tables ("when faults begin and end"): its builder takes
+            `scenarios=`, one per episode.
+        ceiling: No method that is told nothing can be better, as far as is known: it frames the tables.
         settings: Keyword arguments of the builder that belong to this name.
 
     Raises:
-        ValueError: The name is taken, or the builder has no such keyword.
+        ValueError: The name is taken, the builder has no such keyword, or a ceiling that knows nothing.
     """
+    if ceiling and not knows:
+        raise ValueError(f"{name} is called a ceiling, but knows nothing of the truth")
 
     def register(build: Callable[..., Diagnoser]) -> Callable[..., Diagnoser]:
         taken = _entries.get(name)
@@ -133,7 +143,7 @@ def diagnoser(name: str, summary: str, *, clairvoyant: bool = False, **settings:
         for setting in settings:
             if setting not in allowed:
                 raise ValueError(f"{build.__name__} has no setting {setting!r}; it has {', '.join(allowed)}")
-        _entries[name] = Entry(name, summary, build, settings, clairvoyant)
+        _entries[name] = Entry(name, summary, build, settings, knows, ceiling)
         return build
 
     return register
@@ -178,7 +188,7 @@ def find_diagnoser(name: str) -> Entry:
             arguments = {}
         if not arguments:
             raise ValueError(f"{name} is no builder of a diagnoser: it takes no plant")
-        return Entry(name, (inspect.getdoc(build) or name).splitlines()[0], build, {}, False)
+        return Entry(name, (inspect.getdoc(build) or name).splitlines()[0], build, {}, "", False)
     found = diagnosers()
     if name not in found:
         raise unknown("diagnoser", name, found)
