@@ -5,7 +5,7 @@ which the suite was drawn, and lets a method that errs in a known way answer on 
 between flights (all windows of a flight err together) and between windows; within a window the share of right samples is a
 beta variable, and the decision is right where more than half of the samples are. The truth is the balanced accuracy over
 all repetitions together. Three methods are tried: poor, middling and good. The percentile bootstrap, within strata, on the
-same repetitions, is what the intervals are held against.
+first quarter of the repetitions, is what the intervals are held against.
 
     python benchmarks/coverage.py --repetitions 1000 --jobs 2
 """
@@ -35,8 +35,10 @@ class Flight(NamedTuple):
     """What is true of a flight, as far as scores see it."""
 
     decisions: list[int]
-    samples: list[int]  # scored, of each decision's window
-    healthy: int  # scored healthy samples
+    held: int  # the same labels, as bits
+    label: np.ndarray  # of its answers: windows, and the healthy samples where there are windows
+    samples: np.ndarray  # scored, of each
+    decides: np.ndarray  # whether there is a decision about it
 
 
 def script(name):
@@ -61,43 +63,42 @@ def pool_of(suite, plant, count):
         label = plant.label_rows(scenario)
         scored = scored_samples(label, scenario.steps, scoring)
         asked = windows(label, scenario.steps, scored)
-        samples = [int(scored[first:stop].sum()) for first, stop, _ in asked]
-        found.append(Flight([v for *_, v in asked], samples, int((scored & (label == 0)).sum())))
+        labels, samples = [v for *_, v in asked], [int(scored[first:stop].sum()) for first, stop, _ in asked]
+        rest = int((scored & (label == 0)).sum()) if 0 not in labels else 0
+        found.append(Flight(labels, sum(1 << v for v in set(labels)), np.array([*labels, 0]), np.array([*samples, rest]),
+                            np.array([True] * len(labels) + [False])))  # fmt: skip
     return found[:count], found[count:]
 
 
 def drawn(rng, pool, healthy, labels, decisions):
     """A suite: flights taken in random order while they help, and the healthy ones that are made."""
-    held, taken = np.zeros(labels, int), []
+    held, taken, short = [0] * labels, [], (1 << labels) - 1
     for i in rng.permutation(len(pool)):
-        if any(held[label] < decisions for label in pool[i].decisions):
+        if pool[i].held & short:
             taken.append(pool[i])
             for label in pool[i].decisions:
                 held[label] += 1
-        if (held >= decisions).all():
-            break
+                if held[label] == decisions:
+                    short &= ~(1 << label)
+            if not short:
+                break
     return taken + healthy[: max(0, decisions - held[0])]
 
 
 def answered(rng, flights, odds):
     """(right, all) answers (N, labels), per sample and per decision."""
+    of = np.repeat(np.arange(len(flights)), [len(flight.label) for flight in flights])
+    label, samples, decides = (
+        np.concatenate([getattr(f, name) for f in flights]) for name in ("label", "samples", "decides")
+    )
+    mood = FLIGHTS * rng.standard_normal(len(flights))
+    p = 1 / (1 + np.exp(-(odds[label] + mood[of] + WINDOWS * rng.standard_normal(len(label)))))
+    share = rng.beta(p * CONCENTRATION, (1 - p) * CONCENTRATION)
     right, all_ = np.zeros((2, len(flights), len(odds))), np.zeros((2, len(flights), len(odds)))
-    for i, flight in enumerate(flights):
-        mood = FLIGHTS * rng.standard_normal()
-
-        def share(label, mood=mood):
-            p = 1 / (1 + np.exp(-(odds[label] + mood + WINDOWS * rng.standard_normal())))
-            return rng.beta(p * CONCENTRATION, (1 - p) * CONCENTRATION)
-
-        for label, samples in zip(flight.decisions, flight.samples, strict=True):
-            found = share(label)
-            right[1, i, label] += found > 0.5
-            all_[1, i, label] += 1
-            if label:
-                right[0, i, label] += round(found * samples)
-                all_[0, i, label] += samples
-        found = share(0) if flight.healthy and 0 not in flight.decisions else found
-        right[0, i, 0], all_[0, i, 0] = round(found * flight.healthy), flight.healthy
+    np.add.at(right[0], (of, label), np.round(share * samples))
+    np.add.at(all_[0], (of, label), samples)
+    np.add.at(right[1], (of, label), decides & (share > 0.5))
+    np.add.at(all_[1], (of, label), decides)
     return right, all_
 
 
@@ -118,19 +119,26 @@ def study(name, repetitions, method):
     decisions = script("suites").DECISIONS.get(name, 30)
     rng = np.random.default_rng([len(name), round(10 * level)])
     odds = level + LABELS * rng.standard_normal(labels)
-    total, intervals, flights = np.zeros((2, 2, labels)), [], []
-    for _ in range(repetitions):
+    total, intervals, others, flights = np.zeros((2, 2, labels)), [], [], []
+    for turn in range(repetitions):
         mine = drawn(rng, pool, healthy, labels, decisions)
         right, all_ = answered(rng, mine, odds)
         total += [right.sum(axis=1), all_.sum(axis=1)]
         stratum = strata([flight.decisions for flight in mine])
-        intervals.append([[f(right[k], all_[k], stratum) for f in (balanced_interval, percentile)] for k in (0, 1)])
+        intervals.append([balanced_interval(right[k], all_[k], stratum) for k in (0, 1)])
+        if turn < repetitions // 4:
+            others.append([percentile(right[k], all_[k], stratum) for k in (0, 1)])
         flights.append(len(mine))
-    truth, found = (total[0] / total[1]).mean(axis=-1), np.array(intervals)  # (2,), (repetitions, 2, 2, low and high)
-    holds = (found[..., 0] <= truth[:, None] + 1e-12) & (truth[:, None] - 1e-12 <= found[..., 1])
-    cover, width = 100 * holds.mean(axis=0), 100 * (found[..., 1] - found[..., 0]).mean(axis=0)
-    cells = [f(k) for k in (0, 1) for f in (lambda k: f"{100 * truth[k]:.1f}", lambda k: f"{width[k, 0]:.1f}",
-                                            lambda k: f"{cover[k, 0]:.1f}", lambda k: f"{cover[k, 1]:.1f}")]  # fmt: skip
+    truth, found = (total[0] / total[1]).mean(axis=-1), np.array(intervals)  # (2,), (repetitions, 2, low and high)
+
+    def holds(found, k):
+        return 100 * np.mean((found[:, k, 0] <= truth[k] + 1e-12) & (truth[k] - 1e-12 <= found[:, k, 1]))
+
+    cells = [
+        text for k in (0, 1)
+        for text in (f"{100 * truth[k]:.1f}", f"{100 * np.mean(found[:, k, 1] - found[:, k, 0]):.1f}",
+                     f"{holds(found, k):.1f}", f"{holds(np.array(others), k):.1f}")
+    ]  # fmt: skip
     return [name, f"{np.mean(flights):.0f}", method, *cells]
 
 
@@ -142,7 +150,7 @@ def main():
     arguments = parser.parse_args()
     names = [name for name in suite_names() if name.endswith(("-standard", "-hard"))]
     cases = [(name, arguments.repetitions, method) for name in names for method in METHODS]
-    rows = joblib.Parallel(n_jobs=arguments.jobs)(joblib.delayed(study)(*case) for case in cases)
+    rows = joblib.Parallel(n_jobs=arguments.jobs, verbose=5)(joblib.delayed(study)(*case) for case in cases)
     head = ["suite", "flights", "method", "per sample: truth %", "width", "holds %", "bootstrap holds %",
             "per decision: truth %", "width", "holds %", "bootstrap holds %"]  # fmt: skip
     error = 100 * np.sqrt(0.95 * 0.05 / arguments.repetitions)

@@ -14,6 +14,7 @@ they hold the truth, beside the percentile bootstrap, which does not.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -30,7 +31,7 @@ def strata(truths: Sequence[Sequence[int]]) -> Array:
     A stratum of one flight says nothing of its spread: such flights are put together, one that is left to the largest.
     """
     sets = [set(labels) for labels in truths]
-    flights = {label: sum(label in held for held in sets) for held in sets for label in held}
+    flights = Counter(label for held in sets for label in held)
     found = np.array([min(held, key=lambda v: (flights[v], v)) if held else -1 for held in sets], int)
     values, counts = np.unique(found, return_counts=True)
     found[np.isin(found, values[counts == 1])] = -1
