@@ -110,14 +110,19 @@ def percentile(right, all_, stratum):
     return np.percentile(np.nanmean(scores[:, all_.sum(axis=0) > 0], axis=1), [2.5, 97.5])
 
 
-def study(name, repetitions, method):
-    """One line of the table."""
+def study(name, repetitions):
+    """The lines of one suite."""
     suite = load_suite(name)
-    plant, level = suite.build(), METHODS[method]
-    labels = len(plant.labels)
+    plant = suite.build()
     pool, healthy = pool_of(suite, plant, 5000 if plant.id == "HUAVHover" else 1500)
     decisions = script("suites").DECISIONS.get(name, 30)
-    rng = np.random.default_rng([len(name), round(10 * level)])
+    return [[name, *line(pool, healthy, len(plant.labels), decisions, repetitions, method)] for method in METHODS]
+
+
+def line(pool, healthy, labels, decisions, repetitions, method):
+    """How one method fares: mean number of flights, its name and its figures."""
+    level = METHODS[method]
+    rng = np.random.default_rng([labels, round(10 * level)])
     odds = level + LABELS * rng.standard_normal(labels)
     total, intervals, others, flights = np.zeros((2, 2, labels)), [], [], []
     for turn in range(repetitions):
@@ -139,7 +144,7 @@ def study(name, repetitions, method):
         for text in (f"{100 * truth[k]:.1f}", f"{100 * np.mean(found[:, k, 1] - found[:, k, 0]):.1f}",
                      f"{holds(found, k):.1f}", f"{holds(np.array(others), k):.1f}")
     ]  # fmt: skip
-    return [name, f"{np.mean(flights):.0f}", method, *cells]
+    return [f"{np.mean(flights):.0f}", method, *cells]
 
 
 def main():
@@ -149,8 +154,8 @@ def main():
     parser.add_argument("--page", type=Path, default=PAGE)
     arguments = parser.parse_args()
     names = [name for name in suite_names() if name.endswith(("-standard", "-hard"))]
-    cases = [(name, arguments.repetitions, method) for name in names for method in METHODS]
-    rows = joblib.Parallel(n_jobs=arguments.jobs, verbose=5)(joblib.delayed(study)(*case) for case in cases)
+    parallel = joblib.Parallel(n_jobs=arguments.jobs, verbose=5)
+    rows = [row for part in parallel(joblib.delayed(study)(name, arguments.repetitions) for name in names) for row in part]
     head = ["suite", "flights", "method", "per sample: truth %", "width", "holds %", "bootstrap holds %",
             "per decision: truth %", "width", "holds %", "bootstrap holds %"]  # fmt: skip
     error = 100 * np.sqrt(0.95 * 0.05 / arguments.repetitions)
