@@ -191,10 +191,12 @@ def ranking(rows: Sequence[Any], frame: Sequence[Any], bars: Sequence[tuple[int,
         low, high = found["balanced_accuracy_interval"]
         axis.plot([100 * low, 100 * high], [place, place], color=TRUTH, lw=1.6)
         axis.plot(100 * found["balanced_accuracy"], place, "o", color=TRUTH, ms=4)
+    lines: dict[int, list[str]] = {}  # at whole percents, so that the names of null and random don't overlap
     for row in frame:
-        at = 100 * row.metrics["per_sample"]["balanced_accuracy"]
+        lines.setdefault(round(100 * row.metrics["per_sample"]["balanced_accuracy"]), []).append(row.diagnoser)
+    for at, names in lines.items():
         axis.axvline(at, color=INK, lw=0.8, ls=":")
-        axis.annotate(row.diagnoser, (at, 1.0), xycoords=("data", "axes fraction"), fontsize=7, rotation=20, ha="left")
+        axis.annotate(", ".join(names), (at, 1.0), xycoords=("data", "axes fraction"), fontsize=7, rotation=20, ha="left")
     for i, (first, last) in enumerate(bars):
         axis.plot([1.01 + 0.012 * i] * 2, [first - 0.2, last + 0.2], color=SAID, lw=2.5, clip_on=False,
                   transform=axis.get_yaxis_transform())  # fmt: skip

@@ -207,8 +207,9 @@ def test_a_page_is_rendered_from_the_rows_that_are_there(small, found, tmp_path,
     assert pages["small.md"].count("\n| ") == page.count("\n| ") + len(tables.RANKINGS)
     assert "| [small](small.md) | 12 " in pages["README.md"]
     assert "two_stage_kf_exponential" in pages["README.md"]
-    leaderboard.draw(leaderboard.boards(tmp_path)[0], tmp_path / "pictures")
-    assert {p.name for p in (tmp_path / "pictures").iterdir()} == {"small-ranking.png", "small-confusion.png"}
+    pictures = tmp_path.with_name(f"{tmp_path.name}-pictures")
+    leaderboard.draw(leaderboard.boards(tmp_path)[0], pictures)
+    assert {p.name for p in pictures.iterdir()} == {"small-ranking.png", "small-confusion.png"}
     path = row_path(tmp_path, "small", "null")
     path.rename(path.with_name("random.json"))
     with pytest.raises(RefusedError, match="is the row of null"):
