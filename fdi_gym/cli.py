@@ -11,6 +11,7 @@ import tyro
 
 Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="METHOD")]
 SuiteName = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SUITE")]
+WIDTH = 120  # of tables on the screen
 PlantName = Annotated[str, tyro.conf.arg(metavar="PLANT")]
 
 
@@ -67,10 +68,10 @@ def evaluate(
     rows = [f.row for f in found.values()]
     times = {name: f.made.microseconds for name, f in found.items()}
     board = leaderboard.Board(frozen, plant, rows, {name: f.outcomes for name, f in found.items()}, times)
-    print(f"\n{frozen.name}: {frozen.description}\n\n{leaderboard.tables(board, columns)}")
+    print(f"\n{frozen.name}: {frozen.description}\n\n{leaderboard.tables(board, columns, WIDTH)}")
     ranked, best = tables.by_isolation(rows), board.best()
     for shown in {"best": [best] if best else [], "all": ranked, "none": []}[confusion]:
-        print(f"\n{tables.confusion_table(shown, [label.name for label in plant.labels])}")
+        print(f"\n{tables.confusion_table(shown, [label.name for label in plant.labels], WIDTH)}")
     if csv is not None:
         write_whole(csv, tables.comma_separated(rows, times).encode())
         print(f"\nall figures in {csv}")

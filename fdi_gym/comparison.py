@@ -73,8 +73,8 @@ def draw_again(found: Mapping[str, Sequence[Outcome]], labels: int, kind: str = 
         total = weights @ counts
         # a label that a resample lacks stays as it is: it is never dropped
         recall = np.where(total > 0, (weights @ hits) / np.maximum(total, 1), share)
-        score.append(share.mean())
-        again.append(recall.mean(axis=1))
+        score.append(share.mean() if kept.any() else 0.0)
+        again.append(recall.mean(axis=1) if kept.any() else np.zeros(RESAMPLES))
     return Drawn(tuple(found), np.array(score), np.array(again).reshape(len(found), RESAMPLES).T)
 
 

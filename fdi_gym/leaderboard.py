@@ -102,18 +102,18 @@ def read_board(folder: Path) -> Board:
     return Board(suite, plant, rows, outcomes, {name: made.microseconds for name, made in read_made(folder).items()})
 
 
-def tables(board: Board, columns: tuple[str, ...] = ()) -> str:
+def tables(board: Board, columns: tuple[str, ...] = (), width: int | None = None) -> str:
     """The three rankings; or with columns of one's choice one table, ranked by isolation."""
     tied = tied_with_best(board.drawn(board.honest()))
     if columns:
         rows = RANKINGS["Isolation"][0](board.rows)
         rows += [row for row in RANKINGS["Detection"][0](board.rows) if row not in rows]
-        return f"{table(rows, board.times, columns, tied)}\n\n{told(rows)}".rstrip()
+        return f"{table(rows, board.times, columns, tied, width=width)}\n\n{told(rows)}".rstrip()
     parts = []
     for name, (rank, shown) in RANKINGS.items():
         rows = rank(board.rows)
         plant = board.plant if name == "Identification" else None
-        parts.append(f"## {name}\n\n{table(rows, board.times, shown, tied, plant) if rows else 'No rows.'}\n")
+        parts.append(f"## {name}\n\n{table(rows, board.times, shown, tied, plant, width) if rows else 'No rows.'}\n")
     constant = [plain(row.diagnoser) for row in board.rows if not isolates(row) and row.diagnoser not in FLOOR]
     if constant:
         parts.insert(1, f"Not ranked, since they declare one label throughout: {', '.join(constant)}.\n")

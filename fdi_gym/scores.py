@@ -78,6 +78,10 @@ def strata_of(outcomes: Sequence[Outcome]) -> Array:
 
 def _isolation(matrix: Array, stratum: Array) -> dict[str, Any]:
     total = matrix.sum(axis=0)
+    if not total.any():  # nothing was asked: flights that end within the grace
+        return dict.fromkeys(("balanced_accuracy", "balanced_accuracy_interval", "accuracy", "macro_f1")) | {
+            "confusion": [[0] * matrix.shape[2]] * matrix.shape[1]
+        }
     score = balanced_accuracy(total)
     hits, counts = np.diagonal(matrix[..., :-1], axis1=1, axis2=2), matrix.sum(axis=2)
     answers = np.flatnonzero(total.sum(axis=0))
@@ -93,8 +97,13 @@ def _isolation(matrix: Array, stratum: Array) -> dict[str, Any]:
 def _detection(outcomes: Sequence[Outcome], stratum: Array, dt: float) -> dict[str, Any]:
     seen, under = (np.array([[pair[j] for pair in flight.alarmed] for flight in outcomes], float) for j in (0, 1))
     hits = np.column_stack([seen[:, 0] - under[:, 0], under[:, 1]])
-    score = float(np.nanmean(recalls(hits, seen)))
-    silent, loud = not under.any(), bool((under == seen).all())
+    score = interval = None
+    if seen.any():
+        score = float(np.nanmean(recalls(hits, seen)))
+        always = not under.any() or bool(
+            (under == seen).all()
+        )  # never an alarm, or one throughout: nothing is left to chance
+        interval = [score, score] if always else balanced_interval(hits, seen, stratum)
     alarms = np.array([flight.false_alarms for flight in outcomes], float)
     steps = np.array([flight.healthy_steps for flight in outcomes], float)
     below = sum(flight.alarm_steps for flight in outcomes)
@@ -109,7 +118,7 @@ def _detection(outcomes: Sequence[Outcome], stratum: Array, dt: float) -> dict[s
     isolated = survival([o.isolation for o in wanted], [o.length for o in wanted])
     return {
         "balanced_accuracy": score,
-        "balanced_accuracy_interval": [score, score] if silent or loud else balanced_interval(hits, seen, stratum),
+        "balanced_accuracy_interval": interval,
         "false_alarms_per_hour": float(alarms.sum() / hours) if hours else None,
         "false_alarms_per_hour_interval": [float(v) for v in np.percentile(rates, [2.5, 97.5])] if len(rates) else None,
         "healthy_share_under_alarm": float(below / steps.sum()) if hours else None,

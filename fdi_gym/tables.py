@@ -20,10 +20,16 @@ _MARKUP = re.compile(r"([\\`*\[\]|])")
 FLOOR = ("null", "random")  # frame every table from below
 
 
-def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table with aligned columns."""
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]], width: int | None = None) -> str:
+    """A Markdown table with aligned columns; what is wider than `width` goes on below, behind the first column again."""
     lines = [list(head), *[list(row) for row in rows]]
     widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
+    fits = len(head)
+    while width is not None and fits > 2 and sum(widths[:fits]) + 3 * fits + 1 > width:
+        fits -= 1
+    if fits < len(head):
+        rest = [[line[0], *line[fits:]] for line in lines]
+        return f"{markdown(lines[0][:fits], [line[:fits] for line in lines[1:]])}\n\n{markdown(rest[0], rest[1:], width)}"
     text = ["| " + " | ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) + " |" for line in lines]
     text.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
     return "\n".join(text)
@@ -144,12 +150,12 @@ def _ranked(rows: Sequence[Row], figure: Callable[[Row], float]) -> list[Row]:
 def by_isolation(rows: Sequence[Row]) -> list[Row]:
     """Those that isolate, and what frames them, best balanced accuracy per sample first."""
     shown = [row for row in rows if isolates(row) or _framed(row)]
-    return _ranked(shown, lambda row: row.metrics["per_sample"]["balanced_accuracy"])
+    return _ranked(shown, lambda row: row.metrics["per_sample"]["balanced_accuracy"] or 0.0)
 
 
 def by_detection(rows: Sequence[Row]) -> list[Row]:
     """All, best balanced accuracy of their alarms first."""
-    return _ranked(rows, lambda row: row.metrics["detection"]["balanced_accuracy"])
+    return _ranked(rows, lambda row: row.metrics["detection"]["balanced_accuracy"] or 0.0)
 
 
 def by_identification(rows: Sequence[Row]) -> list[Row]:
@@ -171,6 +177,7 @@ def table(
     columns: Sequence[str] = ISOLATION,
     tied: Collection[str] = (),
     plant: Plant | None = None,
+    width: int | None = None,
 ) -> str:
     """A table as Markdown, in the order of the rows. Methods that know a part of the truth are marked *.
 
@@ -179,6 +186,7 @@ def table(
         timing: Microseconds per sample by diagnoser.
         columns: Keys of COLUMNS.
         tied: The diagnosers that cannot be told from the best.
+        width: What is wider goes on below.
         plant: Adds the root mean square error of each estimated entry while a fault acts, with its unit.
 
     Raises:
@@ -198,7 +206,7 @@ def table(
         found = row.metrics["identification"]
         during = found["rmse"]["during"] if found else None
         body.append([*cells, *(f"{during[entry.name]:.3g}" if during else "-" for entry in entries)])
-    return markdown(head, body)
+    return markdown(head, body, width)
 
 
 def told(rows: Sequence[Row]) -> str:
@@ -210,13 +218,13 @@ def told(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def confusion_table(row: Row, labels: Sequence[str], kind: str = "per_sample") -> str:
-    """A confusion matrix as Markdown: rows truth, columns decision, in percent of the row."""
-    counts = np.array(row.metrics[kind]["confusion"], float)
+def confusion_table(row: Row, labels: Sequence[str], width: int | None = None) -> str:
+    """The per-sample confusion matrix as Markdown: rows truth, columns decision, in percent of the row."""
+    counts = np.array(row.metrics["per_sample"]["confusion"], float)
     names = [*labels, "lost"] if counts[:, -1].any() else labels
     share = 100 * counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     body = [[label, *(f"{v:.1f}" for v in share[i, : len(names)])] for i, label in enumerate(labels)]
-    return markdown([row.diagnoser, *names], body)
+    return markdown([row.diagnoser, *names], body, width)
 
 
 def _figures(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:

@@ -284,3 +284,11 @@ def test_a_rare_label_is_never_dropped():
     ]
     assert low < 0.75
     assert high > 0.95
+
+
+def test_flights_that_end_within_the_grace_have_no_score_and_are_no_error():
+    found = scores(episode("..AA", "..AA", scoring=Scoring(start=9)))
+    assert found["decisions"] == 0
+    for kind in ("per_sample", "per_decision"):
+        assert found[kind]["balanced_accuracy"] is None
+        assert found[kind]["balanced_accuracy_interval"] is None

@@ -25,7 +25,14 @@ from fdi_gym.tables import clairvoyant, plain
 KINDS = ("standard", "hard")
 # the filters of the paper that each plant was taken from
 PAPER = {
-    "b747": ("two_stage_kf", "friedland_kf", "augmented_kf", "two_stage_kf_exponential", "two_stage_kf_directional"),
+    "b747": (
+        "two_stage_kf",
+        "friedland_kf",
+        "augmented_kf",
+        "two_stage_kf_exponential",
+        "two_stage_kf_exponential_fast",
+        "two_stage_kf_directional",
+    ),
     "huav": ("three_stage_cdkf", "three_stage_ekf", "robust_three_stage_cdkf", "robust_three_stage_ekf", "ascdkf"),
     "missile": ("approximation_detector", "gos", "gos_strict", "gos_two_class", "gos_two_class_strict"),
     "cmg": ("caukf", "gaukf", "sgaukf", "sgaukf_odd", "dual_gaukf", "dual_sgaukf"),
@@ -33,7 +40,7 @@ PAPER = {
 INTRODUCTION = """# The grid
 
 Every method on every plant. Written by `python -m baselines.reproduction.grid` from the rows in `results/`. Balanced
-accuracy per sample in percent, with a 95 % bootstrap interval over the episodes; "-": not applicable, with the reason
+accuracy per sample in percent, with a 95 % interval; "-": not applicable, with the reason
 that the code gives, or not run yet, both below. Methods marked * know the truth. General methods need nothing but the
 plant's declaration.
 """
