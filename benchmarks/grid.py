@@ -17,14 +17,22 @@ from benchmarks.reproduction.pieces import pieces
 from fdi_gym.diagnosis import diagnosers
 from fdi_gym.evaluation import applicable, evaluate
 from fdi_gym.files import pretty, read_json, write_whole
-from fdi_gym.leaderboard import clairvoyant, markdown, plain, read_rows
+from fdi_gym.leaderboard import read_rows
 from fdi_gym.row import Row, row_path, write_rows
 from fdi_gym.suite import Suite, load_suite
+from fdi_gym.tables import clairvoyant, markdown, plain
 
 KINDS = ("standard", "hard")
 # the filters of the paper that each plant was taken from
 PAPER = {
-    "b747": ("two_stage_kf", "friedland_kf", "augmented_kf", "two_stage_kf_exponential", "two_stage_kf_directional"),
+    "b747": (
+        "two_stage_kf",
+        "friedland_kf",
+        "augmented_kf",
+        "two_stage_kf_exponential",
+        "two_stage_kf_exponential_fast",
+        "two_stage_kf_directional",
+    ),
     "huav": ("three_stage_cdkf", "three_stage_ekf", "robust_three_stage_cdkf", "robust_three_stage_ekf", "ascdkf"),
     "missile": ("approximation_detector", "gos", "gos_strict", "gos_two_class", "gos_two_class_strict"),
     "cmg": ("caukf", "gaukf", "sgaukf", "sgaukf_odd", "dual_gaukf", "dual_sgaukf"),
@@ -32,7 +40,7 @@ PAPER = {
 INTRODUCTION = """# The grid
 
 Every method on every plant. Written by `python -m benchmarks.grid` from the rows in `results/`. Balanced
-accuracy per sample in percent, with a 95 % bootstrap interval over the episodes; "-": not applicable, with the reason
+accuracy per sample in percent, with a 95 % interval; "-": not applicable, with the reason
 that the code gives, or not run yet, both below. Methods marked * know the truth. General methods need nothing but the
 plant's declaration.
 """

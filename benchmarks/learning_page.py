@@ -13,9 +13,10 @@ from typing import Any
 from baselines.learned import weights
 from baselines.learned.weights import Card
 from fdi_gym.files import write_whole
-from fdi_gym.leaderboard import clairvoyant, markdown, read_rows
+from fdi_gym.leaderboard import read_rows
 from fdi_gym.row import Row
 from fdi_gym.suite import suite_names
+from fdi_gym.tables import clairvoyant, markdown
 
 HOME = Path(__file__).parent.parent / "leaderboards"
 LEARNED = ("sequence_net", "residual_net", "ppo", "ppo_identification")
@@ -131,7 +132,7 @@ def identification_table() -> str:
         rows = rows_of(suite)
         if "ppo_identification" in rows:
             for name in ("null", "ppo_identification", *(n for n in LEARNED if n in rows and n.endswith("_net"))):
-                during = rows[name].metrics["rmse"]["during"]
+                during = rows[name].metrics["identification"]["rmse"]["during"]
                 lines.append([suite, name, *(f"{entry} {value:.3g}" for entry, value in during.items())])
     return markdown(["suite", "method", *("" for _ in lines[0][2:])], lines) if lines else "No policy estimates yet."
 

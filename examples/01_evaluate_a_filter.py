@@ -4,10 +4,10 @@ from pathlib import Path
 from tempfile import mkdtemp
 
 from fdi_gym.evaluation import evaluate
-from fdi_gym.leaderboard import confusion_table, table
 from fdi_gym.suite import load_suite
+from fdi_gym.tables import confusion_table, table
 
-suite = load_suite("b747-standard").head(20)  # the first 20 of the frozen 400 episodes
+suite = load_suite("b747-standard").head(20)  # 20 of its flights
 names = ["null", "two_stage_kf", "two_stage_kf_exponential", "known_onset_oracle"]
 
 if __name__ == "__main__":

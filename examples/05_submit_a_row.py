@@ -5,7 +5,7 @@ On the command line, in this folder:
     fdi-gym evaluate b747-standard --diagnosers 02_write_a_diagnoser:mean_innovation_test --results results
     fdi-gym verify results/b747-standard/02_write_a_diagnoser.mean_innovation_test.json \\
         --trust 02_write_a_diagnoser:mean_innovation_test
-    fdi-gym leaderboard --results results --page results/README.md
+    fdi-gym leaderboard --results results --pages results
 """
 
 import sys
@@ -13,9 +13,9 @@ from pathlib import Path
 from tempfile import mkdtemp
 
 from fdi_gym.evaluation import evaluate
-from fdi_gym.leaderboard import table
 from fdi_gym.row import row_path, write_rows
 from fdi_gym.suite import freeze, load_suite
+from fdi_gym.tables import table
 from fdi_gym.verification import verify
 
 sys.path.insert(0, str(Path(__file__).parent))

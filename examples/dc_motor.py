@@ -21,10 +21,10 @@ from fdi_gym.diagnosis import diagnosers
 from fdi_gym.evaluation import applicable, evaluate
 from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Incipient, Scoring
 from fdi_gym.kernels import kernel
-from fdi_gym.leaderboard import table
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
 from fdi_gym.shapes import Shapes
 from fdi_gym.suite import Suite
+from fdi_gym.tables import table
 
 ID, VERSION = "DCMotor", 0
 
@@ -142,7 +142,7 @@ ENV = fdi_gym.register_plant(ID, f"{__name__}:plant")
 def main() -> None:
     suite = Suite(
         name="dc-motor", description="a DC motor", env=ENV, plant=ID, options={}, process="standard", mismatch=None,
-        first_seed=1_000_000, episodes=20, settings={},
+        seeds=list(range(1_000_000, 1_000_020)), settings={},
     ).sealed()  # fmt: skip
     names, _ = applicable(suite, suite.build(), list(diagnosers()))
     with tempfile.TemporaryDirectory() as work:

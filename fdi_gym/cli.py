@@ -11,6 +11,7 @@ import tyro
 
 Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="METHOD")]
 SuiteName = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SUITE")]
+WIDTH = 120  # of tables on the screen
 PlantName = Annotated[str, tyro.conf.arg(metavar="PLANT")]
 
 
@@ -21,6 +22,9 @@ def evaluate(
     work: Path = Path("runs"),
     jobs: int = -1,
     confusion: Literal["best", "all", "none"] = "best",
+    columns: Annotated[tuple[str, ...], tyro.conf.arg(metavar="COLUMN")] = (),
+    csv: Path | None = None,
+    episodes: int | None = None,
     replace: bool = False,
 ) -> None:
     """Run diagnosers on a suite, print the comparison table, and write one row per diagnoser.
@@ -32,13 +36,24 @@ def evaluate(
         work: Folder of finished blocks. A killed run goes on from there.
         jobs: Worker processes, -1 for one per core.
         confusion: Whose confusion matrices to print.
+        columns: One table of these columns in place of the three rankings; a wrong one lists them.
+        csv: A file for all figures, comma-separated.
+        episodes: A quick look: so many of the flights, evenly spread. Makes no rows.
         replace: Rows in the folder that other sources, settings or data have made may go.
     """
-    from fdi_gym import evaluation, leaderboard, row
+    from fdi_gym import evaluation, leaderboard, row, tables
     from fdi_gym.diagnosis import diagnosers as known
+    from fdi_gym.files import write_whole
+    from fdi_gym.names import unknown
     from fdi_gym.suite import load_suite
 
+    for column in columns:
+        if column not in tables.COLUMNS:
+            raise unknown("column", column, tables.COLUMNS)
+    if episodes is not None and results is not None:
+        raise ValueError("rows are made of the whole suite: --results and --episodes don't go together")
     frozen = load_suite(suite)
+    frozen = frozen if episodes is None else frozen.head(episodes)
     plant = frozen.build()
     names = list(known()) if diagnosers == ("all",) else list(dict.fromkeys(diagnosers))
     names, reasons = evaluation.applicable(frozen, plant, names)
@@ -52,11 +67,14 @@ def evaluate(
     found = evaluation.evaluate(frozen, names, work=work, jobs=jobs, command=command)
     rows = [f.row for f in found.values()]
     times = {name: f.made.microseconds for name, f in found.items()}
-    print(f"\n{frozen.name}: {frozen.description}\n\n{leaderboard.table(rows, times)}")
-    ranked = sorted(rows, key=lambda r: -r.metrics["per_sample"]["balanced_accuracy"])
-    honest = [r for r in ranked if not leaderboard.clairvoyant(r)] or ranked
-    for shown in {"best": honest[:1], "all": ranked, "none": []}[confusion]:
-        print(f"\n{leaderboard.confusion_table(shown, [label.name for label in plant.labels])}")
+    board = leaderboard.Board(frozen, plant, rows, {name: f.outcomes for name, f in found.items()}, times)
+    print(f"\n{frozen.name}: {frozen.description}\n\n{leaderboard.tables(board, columns, WIDTH)}")
+    ranked, best = tables.by_isolation(rows), board.best()
+    for shown in {"best": [best] if best else [], "all": ranked, "none": []}[confusion]:
+        print(f"\n{tables.confusion_table(shown, [label.name for label in plant.labels], WIDTH)}")
+    if csv is not None:
+        write_whole(csv, tables.comma_separated(rows, times).encode())
+        print(f"\nall figures in {csv}")
     if results is not None:
         row.write_rows(results, frozen, found)
         print(f"\n{len(rows)} rows in {results / frozen.name}")
@@ -89,18 +107,22 @@ def verify(
         print(f"{path}: every figure follows from the episodes; {len(episodes)} run again, same outcomes: {episodes}")
 
 
-def render(results: Path = Path("leaderboards/results"), page: Path = Path("leaderboards/README.md")) -> None:
-    """Render the tables of all rows.
+def render(results: Path = Path("leaderboards/results"), pages: Path = Path("leaderboards"), pictures: bool = True) -> None:
+    """Render the tables of all rows: README.md, a page for each suite, and their pictures.
 
     Args:
         results: Folder of the rows.
-        page: The page to write.
+        pages: Folder of the pages.
+        pictures: Draw the pictures, too.
     """
     from fdi_gym import leaderboard
     from fdi_gym.files import write_whole
 
-    write_whole(page, leaderboard.render(results).encode())
-    print(page)
+    for name, text in leaderboard.render(results).items():
+        write_whole(pages / name, text.encode())
+        print(pages / name)
+    for board in leaderboard.boards(results) if pictures else ():
+        leaderboard.draw(board, pages / "pictures")
 
 
 def show(name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")] = "") -> None:
@@ -119,27 +141,38 @@ def freeze(
     plant: PlantName,
     process: Annotated[str, tyro.conf.arg(metavar="PROCESS")],
     description: Annotated[str, tyro.conf.arg(metavar="TEXT")],
-    episodes: int,
+    episodes: int | None = None,
+    decisions: int = 30,
+    healthy: bool = True,
+    windows: int = 1,
+    pace: float = 1.0,
+    steps: int | None = None,
     first_seed: int = 1_000_000,
     options: Annotated[dict[str, str], tyro.conf.arg(metavar="OPTION VALUE")] = {},  # noqa: B006 (tyro reads the default)
     mismatch: float | None = None,
     settings: Annotated[str, tyro.conf.arg(metavar="JSON")] = "{}",
     folder: Path | None = None,
 ) -> None:
-    """Freeze a new suite: write its file with the digest of its scenarios.
+    """Draw and freeze a new suite: write its file with its seeds and the digest of its scenarios.
 
     Args:
         name: Name of the suite.
         plant: Plant or environment id; "module:id" where the module registers it.
         process: Fault process.
         description: One line for the table.
-        episodes: How many.
-        first_seed: First public seed.
+        episodes: So many flights of consecutive seeds. Without it flights are drawn by label.
+        decisions: At least so many about every label that the process draws.
+        healthy: Add flights without their faults where the process draws too few healthy ones.
+        windows: Drawn flights whose fault windows follow one another in one.
+        pace: Factor on the times of the faults then.
+        steps: Flights are cut after so many samples.
+        first_seed: The first seed that is looked at.
         options: Options of the plant, as name and value in turn.
         mismatch: Level of mismatch, from 0 to 1; without it what the process prescribes.
         settings: Tuning that belongs to the suite: {"diagnoser": {"keyword": value}}.
         folder: Where the file goes; default: beside the other suites.
     """
+    from fdi_gym.design import by_label
     from fdi_gym.discovery import load_plant
     from fdi_gym.files import decode
     from fdi_gym.listing import find_plant
@@ -149,11 +182,14 @@ def freeze(
     module, plant_id = find_plant(plant)
     built = load_plant(plant_id, **checked_options(plant_id, options, typed=False))
     tuning = decode(settings, dict[str, dict[str, Any]], "--settings is not JSON of settings by diagnoser")
+    count = windows * (1 if episodes is None else episodes)
     suite = Suite(
         name=name, description=description, env=f"{module}:{built.env_id}" if module else built.env_id, plant=plant_id,
-        options=dict(built.options), process=process, mismatch=mismatch, first_seed=first_seed, episodes=episodes,
-        settings=tuning,
+        options=dict(built.options), process=process, mismatch=mismatch, seeds=list(range(first_seed, first_seed + count)),
+        windows=windows, pace=pace, steps=steps, settings=tuning,
     )  # fmt: skip
+    if episodes is None:
+        suite = by_label(suite, decisions, healthy, first_seed)
     print(write(suite, folder or SUITES))
 
 

@@ -22,14 +22,15 @@ import fdi_gym
 from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, make_diagnoser, run
 from fdi_gym.engine import Record, simulate
 from fdi_gym.files import RefusedError, digest, read_json, sweep, write_whole
-from fdi_gym.metrics import Outcome, outcome, summarise
+from fdi_gym.metrics import Outcome, outcome
 from fdi_gym.names import blamed, file_name
 from fdi_gym.plant import Plant
 from fdi_gym.provenance import provenance
 from fdi_gym.row import Evaluated, Made, Row, outcomes_digest
+from fdi_gym.scores import summarise
 from fdi_gym.suite import Suite
 
-BLOCK = 50  # episodes flown and diagnosed together
+BLOCK = 100  # episodes flown and diagnosed together
 
 
 class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -211,13 +211,13 @@ def _check_windows(faults: list[Fault]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Scoring:
-    """Which samples of a process count, and when the one decision of an episode is read.
+    """Which samples of a process count, and how the decision about a fault window or a healthy flight is read.
 
     Args:
         start: First scored sample; sample 0 ends no interval and never counts.
         grace: Samples not scored after each change of the true label, the first sample with the new label included.
-        decision: "final" (the label at the last sample) or "second_half" (the most frequent label over the second
-            half of the fault window; the whole flight where there is no fault).
+        decision: "final" (the label at the last sample of the window, or of the healthy flight) or "second_half" (the most
+            frequent label over the second half of it).
     """
 
     start: int = 1

@@ -1,117 +1,78 @@
-"""The pages of the leaderboards: tables of rows, as Markdown."""
+"""The pages of the leaderboards: one a suite, with its tables and pictures, and the page that leads to them."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
-import numpy as np
-
-from fdi_gym.diagnosis import diagnosers
+from fdi_gym.comparison import Drawn, cliques, draw_again, tied_with_best
 from fdi_gym.files import RefusedError
-from fdi_gym.metrics import BANDS
+from fdi_gym.metrics import Outcome
+from fdi_gym.plant import Plant
 from fdi_gym.row import Row, read_made, read_outcomes, read_row, row_files
-from fdi_gym.suite import load_suite
+from fdi_gym.suite import Suite, load_suite
+from fdi_gym.tables import (
+    FLOOR,
+    RANKINGS,
+    ceiling,
+    clairvoyant,
+    isolates,
+    markdown,
+    plain,
+    table,
+    told,
+)
 from fdi_gym.verification import check_row
-
-_MARKUP = re.compile(r"([\\`*\[\]|])")
-
-
-def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table with aligned columns."""
-    lines = [list(head), *[list(row) for row in rows]]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
-    text = ["| " + " | ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) + " |" for line in lines]
-    text.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
-    return "\n".join(text)
-
-
-def plain(text: str) -> str:
-    """Text from a row, a suite or somebody's code so that Markdown and HTML show it as it is, on one line."""
-    line = "".join(c if c.isprintable() else " " for c in " ".join(text.split()))
-    line = line.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-    return _MARKUP.sub(r"\\\1", line)
-
-
-def clairvoyant(row: Row) -> bool:
-    """Whether the diagnoser of a row knows the truth: what its entry says, never what the row says."""
-    entry = diagnosers().get(row.diagnoser)
-    return entry is not None and entry.clairvoyant
-
-
-def _percent(value: float, interval: list[float] | None = None) -> str:
-    if interval is None:
-        return f"{100 * value:.1f}"
-    return f"{100 * value:.1f} [{100 * interval[0]:.1f}, {100 * interval[1]:.1f}]"
-
-
-def _number(value: float | None, digits: int = 2) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _delay(quartiles: list[float | None]) -> str:
-    low, middle, high = (_number(q, 1) if q is not None else "never" for q in quartiles)
-    return "never" if middle == "never" and low == "never" else f"{middle} ({low}, {high})"
-
-
-COLUMNS = (
-    "method", "per sample %", "per episode %", "raw %", "F1", "small / medium / large %", "false alarms /h", "missed %",
-    "detection s", "isolation s", "RMSE during", "log score", "us/sample",
-)  # fmt: skip
-
-
-def cells(row: Row, microseconds: float | None) -> list[str]:
-    """One line of the table."""
-    m = row.metrics
-    bands = [m["accuracy_by_severity"][band]["per_sample"] for band in BANDS]
-    during = m["rmse"] and m["rmse"]["during"]
-    name = plain(row.diagnoser) + (" (knows the truth)" if clairvoyant(row) else "")
-    lost = f" ({m['lost_episodes']} lost)" if m["lost_episodes"] else ""
-    return [
-        name + lost,
-        _percent(m["per_sample"]["balanced_accuracy"], m["per_sample"]["balanced_accuracy_interval"]),
-        _percent(m["per_episode"]["balanced_accuracy"], m["per_episode"]["balanced_accuracy_interval"]),
-        _percent(m["per_sample"]["accuracy"]),
-        _number(m["per_sample"]["macro_f1"], 3),
-        " / ".join("-" if b is None else f"{100 * b:.0f}" for b in bands),
-        _number(m["false_alarms_per_hour"]),
-        "-" if m["missed_detection_rate"] is None else _percent(m["missed_detection_rate"]),
-        _delay(m["detection_delay_quartiles"]),
-        _delay(m["isolation_delay_quartiles"]),
-        ", ".join(f"{v:.3g}" for v in during.values()) if during else "-",
-        _number(m["log_score"], 3),
-        _number(microseconds, 1),
-    ]
-
-
-def table(rows: Sequence[Row], timing: Mapping[str, float]) -> str:
-    """The comparison table as Markdown, best per-sample balanced accuracy first."""
-    ranked = sorted(rows, key=lambda row: (-row.metrics["per_sample"]["balanced_accuracy"], row.diagnoser))
-    return markdown(COLUMNS, [cells(row, timing.get(row.diagnoser)) for row in ranked])
-
-
-def confusion_table(row: Row, labels: list[str]) -> str:
-    """The per-sample confusion matrix as Markdown: rows truth, columns decision, in percent of the row."""
-    counts = np.array(row.metrics["per_sample"]["confusion"], float)
-    names = [*labels, "lost"] if counts[:, -1].any() else labels
-    share = 100 * counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
-    body = [[label, *(f"{v:.1f}" for v in share[i, : len(names)])] for i, label in enumerate(labels)]
-    return markdown([row.diagnoser, *names], body)
-
 
 INTRODUCTION = """# Leaderboards
 
-Rendered by `fdi-gym leaderboard` from the rows in `results/`; a test renders it again and compares. Balanced accuracy is
-the mean of the diagonal of the row-normalised confusion matrix, in percent, with a 95 % bootstrap interval over
-episodes. Per sample, and per episode (one decision). Raw accuracy never ranks: on some processes "always none" is right
-most of the time. By severity: share of right samples while the smallest active fault is small, medium, large. Delays in
-seconds, median (quartiles), right-censored where never reached. Missed: faults never detected, or already under an
-alarm when they began. RMSE of the estimated entries while a fault acts. The log score is the mean log probability of
-the true label (higher is better). Times per sample are processor times on the machine of the run, in blocks of 50 episodes.
+Rendered by `fdi-gym leaderboard` from the rows in `results/`; a test renders it again and compares. Check a row with
+`fdi-gym verify leaderboards/results/<suite>/<row>.json`.
 
-Check a row with `fdi-gym verify leaderboards/results/<suite>/<row>.json`.
+A suite has at least 30 decisions about every label (papers' suites: about those that the paper's scenario has). There is
+one decision about each window of a fault, and one about each healthy flight. Three tasks are ranked, each by its own figure:
+
+- **Isolation**: balanced accuracy, the mean over the labels of the share of right answers, in percent, per sample (outside
+  the grace after a change) and per decision. Raw accuracy never ranks: often "always none" is right most of the time.
+  S/M/L: share of right samples while the smallest active fault is small, medium, large. The log score is the mean log
+  probability of the true label. Methods that declare one label throughout are not ranked here.
+- **Detection**: mean of the share of healthy samples without and of faulty samples with an alarm. Beside it false alarms
+  per healthy hour (one that is on from the start counts), the share of healthy time under alarm, the share of faults that
+  begin under an alarm, and of the others the share never detected.
+- **Identification**, while a fault acts: the error relative to that of always estimating "healthy" (1), 0 is perfect; the
+  share of errors within 1.96 of the stated deviations (95 % if they are right); NEES per entry (1 if they are right); the
+  root mean square error of each entry with its unit.
+
+Delays in seconds: mean, if longer ones count as the median length of a fault, then median (quartiles), right-censored where
+never reached. Faults that begin under an alarm, or with their label declared already, are left out.
+
+Intervals are 95 %; how often they hold the truth is [measured](coverage.md). Methods are compared on the same flights, by
+a paired bootstrap within labels with Holm's correction; "=" marks those that cannot be told from the best. Methods marked
+"*" know a part of the truth, each page says which; ceilings frame the tables and are never "best". Times are processor
+times per sample on the machine of the run, in blocks of 100 flights.
 """
+
+
+class Board(NamedTuple):
+    """All that is on a suite's page."""
+
+    suite: Suite
+    plant: Plant
+    rows: list[Row]
+    outcomes: dict[str, list[Outcome]]
+    times: dict[str, float]
+
+    def honest(self) -> list[Row]:
+        """The rows of methods that isolate and are told nothing."""
+        return [row for row in self.rows if isolates(row) and not clairvoyant(row) and row.diagnoser not in FLOOR]
+
+    def drawn(self, rows: list[Row], kind: str = "per_sample") -> Drawn:
+        """Their scores, on resamples of the flights."""
+        return draw_again({row.diagnoser: self.outcomes[row.diagnoser] for row in rows}, len(self.plant.labels), kind)
+
+    def best(self) -> Row | None:
+        """The best row of a method that is told nothing."""
+        return max(self.honest(), key=lambda row: row.metrics["per_sample"]["balanced_accuracy"], default=None)
 
 
 def read_rows(folder: Path) -> list[Row]:
@@ -127,23 +88,105 @@ def read_rows(folder: Path) -> list[Row]:
     return rows
 
 
-def render(results: Path) -> str:
-    """The page of all tables.
+def read_board(folder: Path) -> Board:
+    """A suite's rows, each checked against its outcomes.
 
     Raises:
-        RefusedError: A row does not agree with its outcomes or its suite; it is named, and no page is made.
+        RefusedError: A row does not agree with its outcomes or its suite; it is named.
     """
-    parts = [INTRODUCTION]
-    for folder in sorted(path for path in results.glob("*") if path.is_dir()):
-        suite = load_suite(folder.name)
-        plant = suite.build()
-        rows = read_rows(folder)
-        for path, row in zip(row_files(folder), rows, strict=True):
-            check_row(row, read_outcomes(path, row, plant), suite, plant)
-        times = {name: made.microseconds for name, made in read_made(folder).items()}
-        parts.append(
-            f"## {suite.name}\n\n{plain(suite.description)}\n\n`{suite.env}`, process `{suite.process}`, "
-            f"{suite.episodes} episodes, seeds from {suite.first_seed}, version `{suite.sha256[:12]}`.\n\n"
-            f"{table(rows, times) if rows else 'No rows yet.'}\n"
-        )
+    suite, rows, outcomes = load_suite(folder.name), read_rows(folder), {}
+    plant = suite.build()
+    for path, row in zip(row_files(folder), rows, strict=True):
+        outcomes[row.diagnoser] = read_outcomes(path, row, plant)
+        check_row(row, outcomes[row.diagnoser], suite, plant)
+    return Board(suite, plant, rows, outcomes, {name: made.microseconds for name, made in read_made(folder).items()})
+
+
+def tables(board: Board, columns: tuple[str, ...] = (), width: int | None = None) -> str:
+    """The three rankings; or with columns of one's choice one table, ranked by isolation."""
+    tied = tied_with_best(board.drawn(board.honest()))
+    if columns:
+        rows = RANKINGS["Isolation"][0](board.rows)
+        rows += [row for row in RANKINGS["Detection"][0](board.rows) if row not in rows]
+        return f"{table(rows, board.times, columns, tied, width=width)}\n\n{told(rows)}".rstrip()
+    parts = []
+    for name, (rank, shown) in RANKINGS.items():
+        rows = rank(board.rows)
+        plant = board.plant if name == "Identification" else None
+        parts.append(f"## {name}\n\n{table(rows, board.times, shown, tied, plant, width) if rows else 'No rows.'}\n")
+    constant = [plain(row.diagnoser) for row in board.rows if not isolates(row) and row.diagnoser not in FLOOR]
+    if constant:
+        parts.insert(1, f"Not ranked, since they declare one label throughout: {', '.join(constant)}.\n")
+    return "\n".join([*parts, told(board.rows)]).rstrip()
+
+
+def page(board: Board) -> str:
+    """The page of a suite."""
+    suite = board.suite
+    head = (
+        f"# {suite.name}\n\n{plain(suite.description)}\n\n`{suite.env}`, process `{suite.process}`, {suite.episodes} "
+        f"flights, version `{suite.sha256[:12]}`. [What the figures mean](README.md).\n"
+    )
+    if not board.rows:
+        return f"{head}\nNo rows yet.\n"
+    parts = [head, tables(board) + "\n"]
+    best = board.best()
+    if best is not None:
+        parts += [
+            f"![Balanced accuracy, intervals; bars join what cannot be told apart](pictures/{suite.name}-ranking.png)\n",
+            f"![Confusion matrices of {best.diagnoser}](pictures/{suite.name}-confusion.png)\n",
+        ]
     return "\n".join(parts)
+
+
+def draw(board: Board, folder: Path) -> None:
+    """Draw the pictures of a suite's page into a folder: the ranking, and what the best row confuses."""
+    from fdi_gym import plots
+
+    best = board.best()
+    if best is None:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = RANKINGS["Isolation"][0](board.honest())
+    frame = [row for row in board.rows if row.diagnoser in FLOOR or ceiling(row)]
+    drawn = board.drawn(rows)
+    plots.ranking(rows, frame, cliques(drawn)).savefig(folder / f"{board.suite.name}-ranking.png")
+    labels = [label.name for label in board.plant.labels]
+    plots.confusions(best, labels).savefig(folder / f"{board.suite.name}-confusion.png")
+
+
+def boards(results: Path) -> list[Board]:
+    """The boards of all suites in the folder of rows.
+
+    Raises:
+        RefusedError: As `read_board`.
+    """
+    return [read_board(folder) for folder in sorted(path for path in results.glob("*") if path.is_dir())]
+
+
+def front(found: list[Board]) -> str:
+    """The page that leads to the others."""
+    lines = []
+    for board in found:
+        best, above = board.best(), max(
+            (row.metrics["per_sample"]["balanced_accuracy"] for row in board.rows if ceiling(row)), default=None
+        )  # fmt: skip
+        score = best.metrics["per_sample"]["balanced_accuracy"] if best else None
+        tied = len(tied_with_best(board.drawn(board.honest()))) if best else 0
+        lines.append([
+            f"[{board.suite.name}]({board.suite.name}.md)", str(board.suite.episodes), str(len(board.rows)),
+            f"{plain(best.diagnoser)} {100 * score:.1f}" if best and score is not None else "-", str(max(tied - 1, 0)),
+            "-" if above is None else f"{100 * above:.1f}",
+        ])  # fmt: skip
+    head = ["suite", "flights", "rows", "best, per sample %", "not told from it", "ceiling %"]
+    return f"{INTRODUCTION}\n{markdown(head, lines)}\n" if lines else INTRODUCTION
+
+
+def render(results: Path) -> dict[str, str]:
+    """All pages by file name.
+
+    Raises:
+        RefusedError: As `read_board`: no page is made.
+    """
+    found = boards(results)
+    return {"README.md": front(found), **{f"{board.suite.name}.md": page(board) for board in found}}

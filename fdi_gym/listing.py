@@ -98,7 +98,8 @@ def _outside(text: str, name: str) -> str:
 def _suite(suite: Suite) -> str:
     lines = [f"{suite.name}: {suite.description}", "", f"  environment  {suite.env}", f"  options      {suite.options}"]
     lines += [f"  process      {suite.process}", f"  mismatch     {suite.mismatch}"]
-    lines += [f"  seeds        {suite.first_seed} to {suite.first_seed + suite.episodes - 1} ({suite.episodes} episodes)"]
+    seeds = [*suite.seeds, *suite.healthy]
+    lines += [f"  flights      {suite.episodes}, of seeds between {min(seeds)} and {max(seeds)}"]
     lines += [f"  settings of {name}: {settings}" for name, settings in suite.settings.items()]
     return "\n".join([*lines, f"  version      {suite.sha256[:12]}", "", f"  fdi-gym evaluate {suite.name}"])
 

@@ -195,3 +195,64 @@ def method_signals(plant: Plant, record: Record, said: Any, i: int = 0) -> Any:
         _dress(axis, record.label[i, :length], plant.dt)
     axes[-1].set_xlabel("time, s")
     return figure
+
+
+def ranking(rows: Sequence[Any], frame: Sequence[Any], bars: Sequence[tuple[int, int]]) -> Any:
+    """A critical-difference picture: balanced accuracy per sample with its interval, best first.
+
+    Args:
+        rows: Rows (`fdi_gym.row.Row`) in the order of their scores.
+        frame: Rows of floor and ceilings: lines.
+        bars: (first, last) of the runs of rows no two of which can be told apart.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.6, 1.2 + 0.22 * len(rows)), dpi=120, layout="constrained")
+    axis = figure.subplots()
+    scores = [row.metrics["per_sample"] for row in rows]
+    for place, found in enumerate(scores):
+        low, high = found["balanced_accuracy_interval"]
+        axis.plot([100 * low, 100 * high], [place, place], color=TRUTH, lw=1.6)
+        axis.plot(100 * found["balanced_accuracy"], place, "o", color=TRUTH, ms=4)
+    lines: dict[int, list[str]] = {}  # at whole percents, so that the names of null and random don't overlap
+    for row in frame:
+        lines.setdefault(round(100 * row.metrics["per_sample"]["balanced_accuracy"]), []).append(row.diagnoser)
+    for at, names in lines.items():
+        axis.axvline(at, color=INK, lw=0.8, ls=":")
+        axis.annotate(", ".join(names), (at, 1.0), xycoords=("data", "axes fraction"), fontsize=7, rotation=20, ha="left")
+    for i, (first, last) in enumerate(bars):
+        axis.plot([1.01 + 0.012 * i] * 2, [first - 0.2, last + 0.2], color=SAID, lw=2.5, clip_on=False,
+                  transform=axis.get_yaxis_transform())  # fmt: skip
+    axis.set_yticks(range(len(rows)), [row.diagnoser for row in rows], fontsize=7)
+    axis.set_ylim(len(rows) - 0.5, -0.5)
+    axis.set_xlabel("balanced accuracy per sample, %; bars at the right join what cannot be told apart")
+    axis.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def confusions(row: Any, labels: Sequence[str]) -> Any:
+    """A figure of a row's confusion matrices, per sample and per decision, in percent of the true label.
+
+    Args:
+        row: The row (`fdi_gym.row.Row`).
+        labels: Names of the labels.
+    """
+    from matplotlib.figure import Figure
+
+    side = 2.2 + 0.34 * len(labels)
+    figure = Figure(figsize=(2 * side, side), dpi=110, layout="constrained")
+    for axis, kind in zip(figure.subplots(1, 2), ("per_sample", "per_decision"), strict=True):
+        counts = np.array(row.metrics[kind]["confusion"], float)
+        names = [*labels, "lost"] if counts[:, -1].any() else list(labels)
+        total = counts.sum(axis=1, keepdims=True)
+        share = np.where(total > 0, 100 * counts / np.maximum(total, 1), np.nan)[:, : len(names)]
+        axis.imshow(share, vmin=0, vmax=100, cmap="Blues", aspect="auto")
+        for i, j in np.argwhere(share >= 0.5):
+            colour = "white" if share[i, j] > 60 else INK
+            axis.text(j, i, f"{share[i, j]:.0f}", ha="center", va="center", fontsize=6, color=colour)
+        axis.set_xticks(range(len(names)), names, rotation=90, fontsize=6)
+        axis.set_yticks(range(len(labels)), labels, fontsize=6)
+        axis.set_title(f"{row.diagnoser}, {kind.replace('_', ' ')}, %", fontsize=8, loc="left")
+        axis.set_xlabel("declared", fontsize=7)
+        axis.set_ylabel("true", fontsize=7)
+    return figure

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from fdi_gym.diagnosis import find_diagnoser
 from fdi_gym.discovery import load_plant, plant_sources
-from fdi_gym.faults import FaultScenario, draw
+from fdi_gym.faults import MAX_STEPS, FaultScenario, draw
 from fdi_gym.files import RefusedError, digest, pretty, read_json, write_whole
 from fdi_gym.names import blame, check_diagnoser_name, check_name, find_function, find_module, unknown
 from fdi_gym.plant import Plant
@@ -24,7 +25,7 @@ _PACKAGED = Path(__file__).parent / "suites"
 _CHECKOUT = Path(__file__).parent.parent / "leaderboards" / "suites"
 SUITES = _CHECKOUT if _CHECKOUT.is_dir() else _PACKAGED
 LARGEST = 2**20  # bytes of a suite's file
-EPISODES, SEEDS = 100_000, 2**62  # upper ends
+EPISODES, SEEDS, WINDOWS = 100_000, 2**62, 100  # upper ends
 
 
 def scenarios_digest(scenarios: Sequence[FaultScenario]) -> str:
@@ -71,6 +72,24 @@ def checked_options(plant_id: str, options: Mapping[str, Any], *, typed: bool = 
     return found
 
 
+def chained(scenarios: Sequence[FaultScenario], pace: float) -> FaultScenario:
+    """One flight of several: the windows of their faults follow one another, each after the healthy time before it.
+
+    All but the faults is the first one's. Times are multiplied by `pace`; a scenario counts up to the end of its last fault,
+    or whole where it has none, and the flight ends with it.
+    """
+    if len(scenarios) == 1 and pace == 1.0:
+        return scenarios[0]
+    faults, now = [], 0
+    for scenario in scenarios:
+        ends = [scenario.steps if f.end is None else min(f.end, scenario.steps) for f in scenario.faults]
+        for fault, end in zip(scenario.faults, ends, strict=True):
+            onset = now + round(fault.onset * pace)
+            faults.append(msgspec.structs.replace(fault, onset=onset, end=max(onset, now + round(end * pace))))
+        now += max(1, round(max(ends, default=scenario.steps) * pace))
+    return scenarios[0].replace(faults=faults, steps=now)
+
+
 class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What is run.
 
@@ -82,7 +101,11 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         options: Options of the plant.
         process: Name of the fault process.
         mismatch: Level of mismatch, from 0 to 1; None for what the process prescribes.
-        first_seed, episodes: The public seeds are first_seed, first_seed + 1, ...
+        seeds: The public seeds of the flights, `windows` a flight.
+        healthy: Seeds of more flights, after those: flown without their faults.
+        windows: Seeds a flight: the fault windows that they draw follow one another (see `chained`).
+        pace: Factor on the times of the drawn faults where windows are chained.
+        steps: Flights are cut after so many samples; None for as long as they are drawn.
         settings: Per diagnoser, tuning that belongs to this suite (the prior of an oracle).
         scenarios_sha256: Digest of the drawn scenarios: a changed sampler shows.
         sha256: Digest of all the rest of this file.
@@ -98,8 +121,11 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     options: dict[str, Any]
     process: str
     mismatch: float | None
-    first_seed: int
-    episodes: int
+    seeds: list[int]
+    healthy: list[int] = []
+    windows: int = 1
+    pace: float = 1.0
+    steps: int | None = None
     settings: dict[str, dict[str, Any]]
     scenarios_sha256: str = ""
     sha256: str = ""
@@ -110,10 +136,21 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise ValueError(f"a description is one line of up to 300 printable characters, not {self.description[:80]!r}")
         for diagnoser in self.settings:
             check_diagnoser_name(diagnoser)
+        if not 1 <= self.windows <= WINDOWS:
+            raise ValueError(f"windows is from 1 to {WINDOWS}, not {self.windows}")
         if not 1 <= self.episodes <= EPISODES:
-            raise ValueError(f"episodes is from 1 to {EPISODES}, not {self.episodes}")
-        if not 0 <= self.first_seed <= SEEDS:
-            raise ValueError(f"first_seed is from 0 to 2^62, not {self.first_seed}")
+            raise ValueError(f"a suite has from 1 to {EPISODES} flights, not {self.episodes}")
+        for name, seeds in (("seeds", self.seeds), ("healthy", self.healthy)):
+            if len(seeds) % self.windows:
+                raise ValueError(f"{name} are {self.windows} a flight, which {len(seeds)} are not")
+            if len(set(seeds)) < len(seeds):
+                raise ValueError(f"{name} are named once each")
+            if not all(0 <= seed <= SEEDS for seed in seeds):
+                raise ValueError(f"{name} are from 0 to 2^62")
+        if not 0.01 <= self.pace <= 100:
+            raise ValueError(f"pace is from 0.01 to 100, not {self.pace}")
+        if self.steps is not None and not 1 <= self.steps <= MAX_STEPS:
+            raise ValueError(f"steps is from 1 to {MAX_STEPS}, not {self.steps}")
         if self.mismatch is not None and not 0 <= self.mismatch <= 1:
             raise ValueError(f"mismatch is from 0 to 1, not {self.mismatch}")
 
@@ -127,9 +164,24 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         suite = msgspec.structs.replace(self, scenarios_sha256=drawn)
         return msgspec.structs.replace(suite, sha256=suite.content_sha256())
 
+    @property
+    def episodes(self) -> int:
+        """Number of flights."""
+        return (len(self.seeds) + len(self.healthy)) // self.windows
+
     def head(self, episodes: int) -> Suite:
-        """The first episodes as a suite of their own, for a quick look; its rows are not rows of this one."""
-        return msgspec.structs.replace(self, name=f"{self.name}-{episodes}", episodes=episodes).sealed()
+        """So many of the flights, evenly spread, as a suite of their own: a quick look, whose rows are not rows of this one.
+
+        Raises:
+            ValueError: There are not so many.
+        """
+        if not 1 <= episodes <= self.episodes:
+            raise ValueError(f"{self.name} has from 1 to {self.episodes} flights, not {episodes}")
+        w, flights = self.windows, len(self.seeds) // self.windows
+        chosen = np.linspace(0, self.episodes - 1, episodes).round().astype(int)
+        seeds = [seed for i in chosen if i < flights for seed in self.seeds[i * w : (i + 1) * w]]
+        healthy = [seed for i in chosen - flights if i >= 0 for seed in self.healthy[i * w : (i + 1) * w]]
+        return msgspec.structs.replace(self, name=f"{self.name}-{episodes}", seeds=seeds, healthy=healthy).sealed()
 
     def build(self) -> Plant:
         """The plant.
@@ -156,12 +208,17 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         return plant
 
     def scenarios(self, plant: Plant, episodes: Sequence[int]) -> list[FaultScenario]:
-        """The scenarios of these episodes (0, 1, ...): those of `reset(seed=first_seed + i)`."""
+        """The scenarios of these flights (0, 1, ...). Of one seed: that of `reset(seed=seed)`."""
         process, perturb = plant.process(self.process), None
         if self.mismatch is not None:
             drawn: Callable[..., Mapping[str, Any]] = plant.perturb  # type: ignore[assignment]
             perturb = lambda rng: drawn(rng, self.mismatch)  # noqa: E731
-        return [draw(process, self.first_seed + i, perturb) for i in episodes]
+        seeds, w, found = [*self.seeds, *self.healthy], self.windows, []
+        for i in episodes:
+            scenario = chained([draw(process, seed, perturb) for seed in seeds[i * w : (i + 1) * w]], self.pace)
+            scenario = scenario if i * w < len(self.seeds) else scenario.without_faults()
+            found.append(scenario if self.steps is None else scenario.replace(steps=min(scenario.steps, self.steps)))
+        return found
 
     def check_scenarios(self, plant: Plant) -> None:
         """Make sure that this version draws what the suite was frozen with.

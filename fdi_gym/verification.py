@@ -17,10 +17,11 @@ import numpy as np
 from fdi_gym.diagnosis import diagnosers
 from fdi_gym.evaluation import diagnose, digests_of, settings_of
 from fdi_gym.files import RefusedError
-from fdi_gym.metrics import Outcome, summarise
+from fdi_gym.metrics import Outcome
 from fdi_gym.names import unknown
 from fdi_gym.plant import Plant
 from fdi_gym.row import Row, read_outcomes, read_row
+from fdi_gym.scores import summarise
 from fdi_gym.suite import Suite, load_suite
 
 

@@ -44,7 +44,7 @@ def refused(capsys, *arguments):
 def small(tmp_path_factory):
     found = Suite(name="small", description="a test", env="B747Lateral-Faults-v0", plant="B747Lateral",
                   options={"variant": "printed/open", "labels": "single"}, process="standard", mismatch=None,
-                  first_seed=300, episodes=4, settings={})  # fmt: skip
+                  seeds=[*range(300, 304)], settings={})  # fmt: skip
     return freeze(found, tmp_path_factory.mktemp("suites"))
 
 
@@ -83,14 +83,17 @@ WRONG = [
     (("verify", "."), "is no file"), (("verify", "x.json", "--share", "2"), "share is above 0 and up to 1"),
     (("verify", "x.json", "--share", "0"), "share is above 0 and up to 1"),
     (("verify", "x.json", "--seed", "-1"), "seed is 0 or more"),
-    (("leaderboard", "--results", "nowhere", "--page", "nowhere/page.md"), "cannot write nowhere/page.md"),
+    (("leaderboard", "--results", "nowhere", "--pages", "nowhere"), "cannot write nowhere/README.md"),
+    (("evaluate", "b747-paper", "--diagnosers", "null", "--columns", "smple"), "did you mean sample?"),
+    (("evaluate", "b747-paper", "--diagnosers", "null", "--episodes", "0"), "has from 1 to 30 flights, not 0"),
     (("list", "B747Latera"), "did you mean B747Lateral"), (("list", "b747-papr"), "did you mean b747-paper"),
     (("list", "sequence_nets"), "did you mean sequence_net"), (("list", "no_such_module:x"), "cannot import no_such_module"),
     (("list", "B747Lateral-Faults-v9"), "mean B747Lateral-Faults-v0"), (("list", "nowhere.json"), "there is no suite"),
     (("freeze", "../evil", *(standard := ("--plant", "HUAVHover", "--process", "standard", "--description", "d")),
       "--episodes", "1"), "the name of a suite"),
-    (("freeze", "x", *standard, "--episodes", "0"), "episodes is from 1 to"),
-    (("freeze", "x", *standard, "--episodes", "1", "--first-seed", "-1"), "first_seed is from 0"),
+    (("freeze", "x", *standard, "--episodes", "0"), "from 1 to 100000 flights, not 0"),
+    (("freeze", "x", *standard, "--decisions", "0"), "decisions is 1 or more, not 0"),
+    (("freeze", "x", *standard, "--episodes", "1", "--first-seed", "-1"), "seeds are from 0"),
     (("freeze", "x", *standard, "--episodes", "1", "--mismatch", "nan"), "mismatch is from 0 to 1"),
     (("freeze", "x", *standard, "--episodes", "1", "--options", "kapa", "0.5"), "did you mean kappa?"),
     (("freeze", "x", *standard, "--episodes", "1", "--options", "kappa", "much"), "kappa of HUAVHover: Expected `float`"),

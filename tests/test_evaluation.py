@@ -1,6 +1,8 @@
 """Suites and their evaluation: frozen, resumable, the same on any number of blocks and workers."""
 
+import csv
 import json
+import re
 from pathlib import Path
 
 import msgspec
@@ -8,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import ROOT, build
 
-from fdi_gym import cli, evaluation, leaderboard, suite
+from fdi_gym import cli, evaluation, leaderboard, suite, tables
 from fdi_gym.diagnosis import make_diagnoser
 from fdi_gym.envs import FDIEnv
 from fdi_gym.evaluation import evaluate
@@ -25,7 +27,7 @@ def small(tmp_path_factory):
     """A frozen suite of 12 episodes: its path."""
     found = Suite(name="small", description="a test", env="B747Lateral-Faults-v0", plant="B747Lateral",
                   options={"variant": "printed/open", "labels": "single"}, process="standard", mismatch=None,
-                  first_seed=300, episodes=12, settings={})  # fmt: skip
+                  seeds=[*range(300, 312)], settings={})  # fmt: skip
     return freeze(found, tmp_path_factory.mktemp("suites"))
 
 
@@ -40,7 +42,7 @@ def test_rows_agree_with_playing_the_environment(small, found):
     env = FDIEnv(frozen.plant, "isolation", frozen.process, **frozen.options)
     diagnoser = make_diagnoser("two_stage_kf_exponential", env.plant)
     for i in (0, 5):
-        obs, info = env.reset(seed=frozen.first_seed + i)
+        obs, info = env.reset(seed=frozen.seeds[i])
         state, right, over = diagnoser.init(1), 0.0, False
         while True:
             state, said = diagnoser.update(state, obs[None])
@@ -107,21 +109,25 @@ def test_within_a_block_the_quickest_method_comes_first(small, tmp_path, monkeyp
 
 def test_a_frozen_suite_cannot_be_edited(small, tmp_path):
     content = json.loads(small.read_text())
-    content["episodes"] = 3
+    content["seeds"] = [1, 2, 3]
     edited = tmp_path / "small.json"
     edited.write_text(json.dumps(content))
     with pytest.raises(RefusedError, match="edited after it was frozen"):
         load_suite(str(edited))
     with pytest.raises(ValueError, match="choose another name"):
-        freeze(msgspec.structs.replace(load_suite(str(small)), episodes=3), small.parent)
+        freeze(msgspec.structs.replace(load_suite(str(small)), seeds=[1, 2, 3]), small.parent)
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"name": "../evil"}, "the name of a suite"), ({"name": "a/b"}, "the name of a suite"),
-        ({"episodes": 0}, "episodes is from 1"), ({"episodes": 10**9}, "episodes is from 1"),
-        ({"first_seed": -1}, "first_seed is from 0"), ({"mismatch": -0.1}, "mismatch is from 0"),
+        ({"seeds": []}, "from 1 to 100000 flights, not 0"), ({"seeds": list(range(100_001))}, "from 1 to 100000 flights"),
+        ({"seeds": [-1]}, "seeds are from 0"), ({"healthy": [2**62 + 1]}, "healthy are from 0"),
+        ({"seeds": [1, 1]}, "named once"), ({"windows": 5}, "seeds are 5 a flight, which 12 are not"),
+        ({"windows": 0}, "windows is from 1"), ({"pace": 0.0}, "pace is from 0.01"),
+        ({"pace": float("nan")}, "pace is from"), ({"steps": 0}, "steps is from 1"),
+        ({"steps": 10**9}, "steps is from 1"), ({"mismatch": -0.1}, "mismatch is from 0"),
         ({"mismatch": float("nan")}, "mismatch is from 0"), ({"description": "two\nlines"}, "one line"),
         ({"settings": {"../x": {}}}, "the name of a diagnoser"), ({"process": "standrd"}, "did you mean standard"),
         ({"plant": "B747"}, "unknown plant"), ({"options": {"variant": 3}}, "variant"),
@@ -156,7 +162,8 @@ def test_committed_suites_draw_what_they_were_frozen_with(name):
 def test_suite_seeds_are_public_test_seeds():
     """Suites use the seeds from 1,000,000 on; nothing that is tuned or trained may."""
     for name in suite_names():
-        assert load_suite(name).first_seed >= 1_000_000
+        found = load_suite(name)
+        assert min(found.seeds + found.healthy) >= 1_000_000
 
 
 # -- the pages
@@ -164,7 +171,10 @@ def test_suite_seeds_are_public_test_seeds():
 
 def test_committed_page_is_what_the_rows_say():
     """Renders the tables again, which checks every row on the way."""
-    assert leaderboard.render(ROOT / "leaderboards" / "results") == (ROOT / "leaderboards" / "README.md").read_text()
+    for name, text in leaderboard.render(ROOT / "leaderboards" / "results").items():
+        assert (ROOT / "leaderboards" / name).read_text() == text
+        for picture in re.findall(r"\((pictures/.*?)\)", text):
+            assert (ROOT / "leaderboards" / picture).exists()
 
 
 def test_every_committed_table_is_framed():
@@ -172,17 +182,34 @@ def test_every_committed_table_is_framed():
     for folder in sorted((ROOT / "leaderboards" / "results").glob("*/")):
         rows = leaderboard.read_rows(folder)
         assert {"null", "random"} <= {row.diagnoser for row in rows}, folder.name
-        assert any(leaderboard.clairvoyant(row) for row in rows), folder.name
+        assert any(tables.ceiling(row) for row in rows), folder.name
+
+
+def test_no_committed_row_beats_a_ceiling():
+    """Beyond the paired interval, per sample and per decision: else it is none."""
+    for board in leaderboard.boards(ROOT / "leaderboards" / "results"):
+        for kind in ("per_sample", "per_decision"):
+            drawn = board.drawn(board.rows, kind)
+            for above in (row.diagnoser for row in board.rows if tables.ceiling(row)):
+                for name in (row.diagnoser for row in board.rows if not tables.clairvoyant(row)):
+                    assert drawn.difference(name, above)[1] <= 0, (board.suite.name, kind, name, above)
 
 
 def test_a_page_is_rendered_from_the_rows_that_are_there(small, found, tmp_path, monkeypatch):
     monkeypatch.setattr(suite, "SUITES", small.parent)
-    assert leaderboard.render(tmp_path) == leaderboard.INTRODUCTION
+    assert leaderboard.render(tmp_path) == {"README.md": leaderboard.INTRODUCTION}
     write_rows(tmp_path, load_suite("small"), {name: found[name] for name in ("null", "known_onset_oracle")})
-    page = leaderboard.render(tmp_path)
-    assert page.index("| known_onset_oracle (knows the truth) |") < page.index("| null ")
+    page = leaderboard.render(tmp_path)["small.md"]
+    assert page.index("| known_onset_oracle * |") < page.index("| null ")
+    assert "- known_onset_oracle knows when each fault begins and ends." in page
     write_rows(tmp_path, load_suite("small"), {"two_stage_kf_exponential": found["two_stage_kf_exponential"]})
-    assert leaderboard.render(tmp_path).count("\n| ") == page.count("\n| ") + 1
+    pages = leaderboard.render(tmp_path)
+    assert pages["small.md"].count("\n| ") == page.count("\n| ") + len(tables.RANKINGS)
+    assert "| [small](small.md) | 12 " in pages["README.md"]
+    assert "two_stage_kf_exponential" in pages["README.md"]
+    pictures = tmp_path.with_name(f"{tmp_path.name}-pictures")
+    leaderboard.draw(leaderboard.boards(tmp_path)[0], pictures)
+    assert {p.name for p in pictures.iterdir()} == {"small-ranking.png", "small-confusion.png"}
     path = row_path(tmp_path, "small", "null")
     path.rename(path.with_name("random.json"))
     with pytest.raises(RefusedError, match="is the row of null"):
@@ -191,7 +218,7 @@ def test_a_page_is_rendered_from_the_rows_that_are_there(small, found, tmp_path,
 
 def test_text_from_files_is_shown_as_it_is():
     text = "a | b `c` <script>d</script>\n# e * [f](g) \x1b[31m &lt;"
-    shown = leaderboard.plain(text)
+    shown = tables.plain(text)
     assert "\n" not in shown
     assert "\x1b" not in shown
     assert "<" not in shown
@@ -199,8 +226,17 @@ def test_text_from_files_is_shown_as_it_is():
         assert shown.count(mark) == shown.count("\\" + mark) == text.count(mark)
 
 
+def test_a_table_that_is_too_wide_goes_on_below():
+    head, body = ["method", *"abcdef"], [["one", *"123456"], ["two", *"789012"]]
+    parts = tables.markdown(head, body, 24).split("\n\n")
+    assert all(len(line) <= 24 for part in parts for line in part.splitlines())
+    assert all(part.splitlines()[3].startswith("| two ") for part in parts)
+    assert [c for part in parts for c in part.splitlines()[2].replace(" ", "").split("|")[2:-1]] == list("123456")
+    assert tables.markdown(head, body, 200) == tables.markdown(head, body)
+
+
 def test_confusion_matrix_prints_percent_of_rows(found):
-    text = leaderboard.confusion_table(found["null"].row, [label.name for label in build("B747Lateral").labels])
+    text = tables.confusion_table(found["null"].row, [label.name for label in build("B747Lateral").labels])
     assert np.isclose(float(text.splitlines()[2].split("|")[2]), 100.0)
 
 
@@ -209,7 +245,7 @@ def test_confusion_matrix_prints_percent_of_rows(found):
 
 def test_command_line_end_to_end(capsys, small, tmp_path, monkeypatch):
     monkeypatch.setattr(suite, "SUITES", small.parent)
-    results, page = tmp_path / "results", tmp_path / "page.md"
+    results, pages = tmp_path / "results", tmp_path / "pages"
     cli.main(["evaluate", "small", "--diagnosers", "null", "two_stage_kf", "--results", str(results), "--work",
               str(tmp_path / "work"), "--jobs", "1"])  # fmt: skip
     shown = capsys.readouterr().out
@@ -217,8 +253,37 @@ def test_command_line_end_to_end(capsys, small, tmp_path, monkeypatch):
     assert "rudder stuck" in shown
     cli.main(["verify", *map(str, (results / "small").glob("*.json"))])
     assert capsys.readouterr().out.count("same outcomes") == 2
-    cli.main(["leaderboard", "--results", str(results), "--page", str(page)])
-    assert page.read_text().count("| null") == 1
+    pages.mkdir()
+    cli.main(["leaderboard", "--results", str(results), "--pages", str(pages)])
+    assert (pages / "small.md").read_text().count("| null") == len(tables.RANKINGS)
+    assert (pages / "pictures" / "small-ranking.png").exists()
+
+
+def test_a_quick_look_fits_the_screen_and_makes_no_rows(capsys, small, tmp_path):
+    """Of some flights, evenly spread; with the columns and the file that are asked for."""
+    look = ["evaluate", str(small), "--diagnosers", *NAMES, "--work", str(tmp_path), "--jobs", "1", "--episodes", "3"]
+    cli.main([*look, "--csv", str(tmp_path / "all.csv")])
+    shown = capsys.readouterr().out
+    assert max(len(line) for line in shown.splitlines() if "|" in line) <= 120
+    assert all(f"## {name}" in shown for name in tables.RANKINGS)
+    assert "gamma_aileron" in shown
+    lines = list(csv.DictReader((tmp_path / "all.csv").read_text().splitlines()))
+    assert [line["diagnoser"] for line in lines] == NAMES
+    assert float(lines[0]["per_sample.balanced_accuracy"]) <= 0.5
+    assert lines[2]["knows"] == "when each fault begins and ends"
+    cli.main([*look, "--columns", "decision", "under"])
+    shown = capsys.readouterr().out
+    assert "per decision %" in shown
+    assert "under alarm %" in shown
+    assert "per sample %" not in shown
+    for wrong, words in (
+        (["--columns", "decisions"], "did you mean decision"),
+        (["--results", str(tmp_path)], "whole suite"),
+        (["--episodes", "13"], "from 1 to 12 flights"),
+    ):
+        with pytest.raises(SystemExit):
+            cli.main([*look, *wrong])
+        assert words in capsys.readouterr().err
 
 
 def test_a_diagnoser_by_module_and_function(capsys, small, tmp_path):

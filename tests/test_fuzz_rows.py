@@ -106,7 +106,7 @@ def home(tmp_path_factory):
     folder = tmp_path_factory.mktemp("home")
     small = Suite(name="small", description="a test", env="B747Lateral-Faults-v0", plant="B747Lateral",
                   options={"variant": "printed/open", "labels": "single"}, process="standard", mismatch=None,
-                  first_seed=300, episodes=2, settings={"two_stage_kf": {"threshold": 9.0}})  # fmt: skip
+                  seeds=[*range(300, 302)], settings={"two_stage_kf": {"threshold": 9.0}})  # fmt: skip
     frozen = load_suite(str(freeze(small, folder)))
     names = ["null", "random", "two_stage_kf"]
     write_rows(folder, frozen, evaluate(frozen, names, work=folder / "work", jobs=1, progress=False))

@@ -8,7 +8,8 @@ from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnosers, guarded, make_di
 from fdi_gym.diagnosis.contract import map_arrays
 from fdi_gym.engine import simulate
 from fdi_gym.faults import draw
-from fdi_gym.metrics import outcome, summarise
+from fdi_gym.metrics import outcome
+from fdi_gym.scores import summarise
 
 N, SAMPLES, BAD = 4, 30, 12  # episodes, samples, the sample from which on something is wrong with episode 1
 
@@ -111,7 +112,9 @@ def test_scores_stay_in_their_range(b747, field, value):
     assert bad["log_score"] < -1.0
     assert bad["lost_episodes"] == 1
     assert bad["per_sample"]["accuracy"] == pytest.approx(1 - (SAMPLES - BAD) / (N * (SAMPLES - 1)))
-    assert all(np.isfinite(v) and v < 1e3 for phase in bad["rmse"].values() if phase for v in phase.values())
+    assert all(
+        np.isfinite(v) and v < 1e3 for phase in bad["identification"]["rmse"].values() if phase for v in phase.values()
+    )
 
 
 @pytest.mark.parametrize("plant_id", PLANTS)

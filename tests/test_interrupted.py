@@ -26,7 +26,7 @@ cli.main(sys.argv[1:])
 def suite(tmp_path_factory):
     found = Suite(name="small", description="a test", env="B747Lateral-Faults-v0", plant="B747Lateral",
                   options={"variant": "printed/open", "labels": "single"}, process="standard", mismatch=None,
-                  first_seed=300, episodes=12, settings={})  # fmt: skip
+                  seeds=[*range(300, 312)], settings={})  # fmt: skip
     return freeze(found, tmp_path_factory.mktemp("suites"))
 
 

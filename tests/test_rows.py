@@ -14,15 +14,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from fdi_gym import evaluation, leaderboard, row, suite, verification
+from fdi_gym import evaluation, leaderboard, row, suite, tables, verification
 from fdi_gym import plant as plant_module
 from fdi_gym.diagnosis import diagnosers, registry
 from fdi_gym.estimation import data
 from fdi_gym.evaluation import applicable, digests_of, evaluate, settings_of
 from fdi_gym.files import RefusedError, compress, digest, pretty, sweep, write_whole
-from fdi_gym.metrics import Outcome, summarise
+from fdi_gym.metrics import Decision, Onset, Outcome, Stated
 from fdi_gym.provenance import provenance, sources
 from fdi_gym.row import check_writable, outcomes_path, outcomes_text, read_outcomes, read_row, row_path, write_rows
+from fdi_gym.scores import summarise
 from fdi_gym.suite import Suite, freeze, load_suite, suite_names
 from fdi_gym.verification import verify
 
@@ -37,7 +38,7 @@ def home(tmp_path_factory):
     folder = tmp_path_factory.mktemp("home")
     small = Suite(name="small", description="a test", env="B747Lateral-Faults-v0", plant="B747Lateral",
                   options={"variant": "printed/open", "labels": "single"}, process="standard", mismatch=None,
-                  first_seed=300, episodes=8, settings={})  # fmt: skip
+                  seeds=[*range(300, 308)], settings={})  # fmt: skip
     frozen = load_suite(str(freeze(small, folder)))
     write_rows(folder, frozen, evaluate(frozen, NAMES, work=folder / "work", command="test", **QUIET))
     return folder
@@ -152,7 +153,7 @@ def test_a_clairvoyant_row_cannot_be_given_to_another(rows):
     shutil.copy(outcomes_path(oracle), outcomes_path(path))
     with pytest.raises(RefusedError, match=r"outcomes\[\d+\]"):
         verify(path, share=0.5)
-    assert leaderboard.clairvoyant(read_row(oracle))
+    assert tables.clairvoyant(read_row(oracle))
 
 
 def doctored(rows, which):
@@ -233,8 +234,13 @@ def test_outcomes_that_no_flight_can_have_are_refused(rows):
     outcomes = read_outcomes(path, read_row(path), plant)
     first = outcomes[0]
     changes = [
-        {"decision": (99, 0)}, {"confusion": [(0, 7, 3)]}, {"confusion": [(0, 0, 10**6)]}, {"false_alarms": 10**9},
-        {"squared_error": [[0.0]]}, {"squared_error": [[-1.0] * 4] * 3}, {"band": 5}, {"banded": [(1, 2), (0, 0), (0, 0)]},
+        {"decisions": [Decision(99, 0, 0)]}, {"decisions": [Decision(0, 0, 1)]}, {"decisions": [Decision(1, 0, 5)]},
+        {"decisions": [Decision(0, 0, None)] * (first.steps + 1)}, {"alarm_steps": first.healthy_steps + 1},
+        {"alarmed": [(1, 2), (0, 0)]}, {"alarmed": [(1, 1)]}, {"squared_fault": [1.0]}, {"squared_fault": [-1.0] * 4},
+        {"stated": [Stated(1, 2, 0.0)] * 4}, {"stated": [Stated(1, 1, 0.0)]}, {"stated": [Stated(1, 1, -1.0)] * 4},
+        {"onsets": [Onset(1, 3, True, True, False, 2, None)]}, {"onsets": [Onset(1, 3, True, False, True, None, 2)]},
+        {"confusion": [(0, 7, 3)]}, {"confusion": [(0, 0, 10**6)]}, {"false_alarms": 10**9},
+        {"squared_error": [[0.0]]}, {"squared_error": [[-1.0] * 4] * 3}, {"banded": [(1, 2), (0, 0), (0, 0)]},
         {"error_steps": [1]}, {"log_score": 1.0}, {"healthy_steps": first.steps + 1},
     ]  # fmt: skip
     for fields in changes:
@@ -428,7 +434,7 @@ def test_an_edited_plant_outside_the_package_gives_new_rows(rows, modules, monke
         sys.modules.pop("outside_plant", None)
         importlib.invalidate_caches()
         frozen = Suite(name="outside", description="", env="outside_plant:Outside747-Faults-v0", plant="Outside747",
-                       options={}, process="standard", mismatch=None, first_seed=0, episodes=2, settings={})  # fmt: skip
+                       options={}, process="standard", mismatch=None, seeds=[*range(2)], settings={})  # fmt: skip
         return evaluate(frozen.sealed(), ["two_stage_kf"], work=rows.parent / "work", **QUIET)["two_stage_kf"].row
 
     first = made(PLANT)

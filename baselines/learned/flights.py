@@ -13,8 +13,9 @@ from fdi_gym.diagnosis import Diagnosis, make_diagnoser, run
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import Record, simulate
 from fdi_gym.faults import draw
-from fdi_gym.metrics import balanced_accuracy, scored_samples
+from fdi_gym.metrics import scored_samples
 from fdi_gym.plant import Array, Plant
+from fdi_gym.scores import balanced_accuracy
 
 # the first seed of each split, which ends where the next begins
 TEST, VALIDATION, CALIBRATION, TRAINING = 1_000_000, 2_000_000, 2_500_000, 3_000_000

@@ -2,8 +2,9 @@
 
 The covariance of a Kalman filter linearised on the true trajectory is the (posterior) Cramer-Rao bound of the model
 with Gaussian noise: f is known before the first change, and has the prior 0.25 I at each. The oracle draws an estimate
-from N(f, P_ff) every 0.1 s and asks for the most probable set of faulty units. It forgets at every change what it knew,
-so it is a reference point and not an upper bound.
+from N(f, P_ff) every 0.1 s around the true f and asks for the most probable set of faulty units: what it says does not
+depend on the observations. It forgets at every change what it knew, which a filter need not do; it frames the satellite's
+tables since no method has been measured above it.
 
 P. Tichavsky, C. H. Muravchik, A. Nehorai, IEEE Trans. Signal Processing 46(5), 1998 (bound); classifier: data sheet.
 """
@@ -87,7 +88,12 @@ class Oracle(NamedTuple):
     episode: Array  # (n,) which of the scenarios
 
 
-@diagnoser("cramer_rao_oracle", "Cramer-Rao bound and classifier, told when the effectiveness changes", clairvoyant=True)
+@diagnoser(
+    "cramer_rao_oracle",
+    "True effectiveness with the error of the Cramer-Rao bound, classified; looks at no observation",
+    knows="the effectiveness, up to the Cramer-Rao bound",
+    ceiling=True,
+)
 def cramer_rao_oracle(
     plant: Plant, *, scenarios: Sequence[FaultScenario], alpha_min: float = 0.02, alpha_max: float = 1.0
 ) -> Diagnoser:

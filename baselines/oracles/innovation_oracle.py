@@ -199,7 +199,12 @@ def most_probable() -> Rule:
     return Rule(lambda n: None, step)
 
 
-@diagnoser("innovation_oracle", "Knows the onset: evidence of the innovations under the process's priors", clairvoyant=True)
+@diagnoser(
+    "innovation_oracle",
+    "Evidence of the innovations under the process's priors, within the known windows of faults",
+    knows="when each fault begins and ends",
+    ceiling=True,
+)
 def innovation_oracle(
     plant: Plant, *, scenarios: Sequence[FaultScenario], hard: bool = False, every: int = 1, none_allowed: bool = True
 ) -> Diagnoser:

@@ -34,7 +34,12 @@ class Windowed(NamedTuple):
     on: Array  # (n,) a fault acted over the last interval
 
 
-@diagnoser("known_onset_oracle", "Is told when each fault begins and ends, not what it is", clairvoyant=True)
+@diagnoser(
+    "known_onset_oracle",
+    "Bayes classifier within the known windows of faults",
+    knows="when each fault begins and ends",
+    ceiling=True,
+)
 def known_onset_oracle(
     plant: Plant,
     *,

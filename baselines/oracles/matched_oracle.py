@@ -142,7 +142,12 @@ def found_by(s: Matched, choices: Array, threshold: float) -> Found:
     return Found(on, b, variance)
 
 
-@diagnoser("matched_oracle", "Oracle: onset and shape of the error known, channel and size not", clairvoyant=True)
+@diagnoser(
+    "matched_oracle",
+    "Matched filters of the known errors of commands, channel and size not known",
+    knows="when each fault begins and ends, and its error's shape",
+    ceiling=True,
+)
 def matched_oracle(
     plant: Plant, *, scenarios: Sequence[FaultScenario], threshold: float = 10.83, d_step: float = 0.05
 ) -> Diagnoser:

@@ -23,7 +23,11 @@ def changes(plant: Plant, scenarios: Sequence[FaultScenario]) -> Array:
     return found
 
 
-@diagnoser("mekf_clairvoyant", "The same filter, told when the effectiveness changes", clairvoyant=True)
+@diagnoser(
+    "mekf_clairvoyant",
+    "The same filter, told when the effectiveness changes",
+    knows="when the effectiveness changes",
+)
 def mekf_clairvoyant(
     plant: Plant, *, scenarios: Sequence[FaultScenario], q_theta: float = Q_THETA, threshold: float = THRESHOLD
 ) -> Diagnoser:

@@ -59,7 +59,13 @@ class Entry(NamedTuple):
     summary: str
     build: Callable[..., Any]  # the builder of the diagnoser, or the function that trains
     settings: Mapping[str, Any]  # that belong to the name
-    clairvoyant: bool = False
+    knows: str = ""  # of the truth, in words; empty for a method that is told nothing
+    ceiling: bool = False  # what it knows is more than any method can find out: it frames a table
+
+    @property
+    def clairvoyant(self) -> bool:
+        """Whether it knows a part of the truth."""
+        return bool(self.knows)
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -124,19 +130,23 @@ def paper_tuning(entry: Entry, plant: Plant, asked: Mapping[str, Any]) -> dict[s
 _entries: dict[Kind, dict[str, Entry]] = {"diagnoser": {}, "trainer": {}}
 
 
-def diagnoser(name: str, summary: str, *, clairvoyant: bool = False, **settings: Any) -> Callable[[Any], Any]:
+def diagnoser(name: str, summary: str, *, knows: str = "", ceiling: bool = False, **settings: Any) -> Callable[[Any], Any]:
     """Make a builder known under a name. Stacked, it gives one builder several names with different settings.
 
     Args:
         name: As users and tables call it.
         summary: One line for tables.
-        clairvoyant: The builder takes `scenarios=`, one per episode, and its row says that it knows the truth.
+        knows: What it is told of the truth, in a few words for tables ("when faults begin and end"): its builder takes
+            `scenarios=`, one per episode.
+        ceiling: No method that is told nothing can be better, as far as is known: it frames the tables.
         settings: Keyword arguments of the builder that belong to this name.
 
     Raises:
-        ValueError: The name is taken, or the builder has no such keyword.
+        ValueError: The name is taken, the builder has no such keyword, or a ceiling that knows nothing.
     """
-    return functools.partial(_register, "diagnoser", name, summary, settings, clairvoyant)
+    if ceiling and not knows:
+        raise ValueError(f"{name} is called a ceiling, but knows nothing of the truth")
+    return functools.partial(_register, "diagnoser", name, summary, settings, knows, ceiling)
 
 
 def trainer(name: str, summary: str, **settings: Any) -> Callable[[Any], Any]:
@@ -145,11 +155,17 @@ def trainer(name: str, summary: str, **settings: Any) -> Callable[[Any], Any]:
     Raises:
         ValueError: As there.
     """
-    return functools.partial(_register, "trainer", name, summary, settings, False)
+    return functools.partial(_register, "trainer", name, summary, settings, "", False)
 
 
 def _register(
-    kind: Kind, name: str, summary: str, settings: Mapping[str, Any], clairvoyant: bool, build: Callable[..., Any]
+    kind: Kind,
+    name: str,
+    summary: str,
+    settings: Mapping[str, Any],
+    knows: str,
+    ceiling: bool,
+    build: Callable[..., Any],
 ) -> Callable[..., Any]:
     taken = _entries[kind].get(name)
     if taken is not None and (taken.build.__module__, taken.build.__qualname__) != (build.__module__, build.__qualname__):
@@ -158,7 +174,7 @@ def _register(
     for setting in settings:
         if setting not in allowed:
             raise ValueError(f"{build.__name__} has no setting {setting!r}; it has {', '.join(allowed)}")
-    _entries[kind][name] = Entry(kind, name, summary, build, settings, clairvoyant)
+    _entries[kind][name] = Entry(kind, name, summary, build, settings, knows, ceiling)
     return build
 
 

@@ -13,9 +13,9 @@ from benchmarks.reproduction.comparison import Comparisons, binomial_error, show
 from benchmarks.reproduction.numbered import fly
 from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.discovery import load_plant
-from fdi_gym.leaderboard import markdown
 from fdi_gym.plants import b747_lateral as b747
 from fdi_gym.plots import flight
+from fdi_gym.tables import markdown
 
 INTRODUCTION = """# Boeing 747: the reference figures, measured again
 

@@ -16,7 +16,7 @@ from benchmarks.reproduction.cmg_satellite.results import (
     spread,
     units,
 )
-from fdi_gym.leaderboard import markdown
+from fdi_gym.tables import markdown
 
 METHODS = ("UKF", *GRIDS, "dual GAUKF", "MEKF", "CLAIR")
 VARIANTS = {"bench": '"bench"', "table5": "Table 5's ranges"}

@@ -17,7 +17,7 @@ from benchmarks.reproduction.cmg_satellite.results import (
     triple,
     wilson,
 )
-from fdi_gym.leaderboard import markdown
+from fdi_gym.tables import markdown
 
 PAPER = REFERENCE["paper"]
 ANOMALIES = """Anomalies of the source that bear on this: its Jacobian has two wrong signs; Table 3 prints the first

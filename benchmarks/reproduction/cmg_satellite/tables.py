@@ -17,7 +17,7 @@ from benchmarks.reproduction.cmg_satellite.plan import (
     TRIED,
 )
 from benchmarks.reproduction.cmg_satellite.results import PHASES, Results, between, column, flags, right
-from fdi_gym.leaderboard import markdown
+from fdi_gym.tables import markdown
 
 TABLE_4 = REFERENCE["table_4"]
 

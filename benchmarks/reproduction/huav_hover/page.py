@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from benchmarks.reproduction.comparison import Comparisons
 from benchmarks.reproduction.huav_hover.measure import BOUND_AFTER, FILTERS, KAPPAS, REFERENCE, SETS, scenario_key
-from fdi_gym.leaderboard import markdown
 from fdi_gym.plants.huav_hover import CHANNELS, DT, MRAD, STEPS
+from fdi_gym.tables import markdown
 
 SHORT = {"ascdkf": "ASCDKF", "three_stage_cdkf": "ThSCDKF", "three_stage_ekf": "ThSEKF",
          "robust_three_stage_cdkf": "RThSCDKF", "robust_three_stage_ekf": "RThSEKF",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from fdi_gym.leaderboard import markdown
+from fdi_gym.tables import markdown
 
 
 class Claims:

@@ -13,9 +13,9 @@ from baselines.filters.generalised_observer_scheme import ALL, SEVERAL
 from benchmarks.reproduction.comparison import rms
 from benchmarks.reproduction.missile_pitch.claims import Claims, beside
 from benchmarks.reproduction.missile_pitch.measure import DT, REFERENCE, STEPS, batches
-from fdi_gym.leaderboard import markdown
 from fdi_gym.plant import Array
 from fdi_gym.plants import missile_pitch as missile
+from fdi_gym.tables import markdown
 
 TIMES = ["T0 + 2 s", "T0 + 4 s", "end"]
 VERDICT_OF = {"1, 2": "strict two", "1, 2, 3, 4, 5": "strict five"}  # a bank's classes: its strict verdicts in a piece

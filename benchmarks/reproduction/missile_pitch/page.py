@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from benchmarks.reproduction.missile_pitch.claims import Claims, beside
 from benchmarks.reproduction.missile_pitch.episodes import randomised, variants
 from benchmarks.reproduction.missile_pitch.measure import DT, REFERENCE, STEPS, sizes
-from fdi_gym.leaderboard import markdown
 from fdi_gym.plants import missile_pitch as missile
+from fdi_gym.tables import markdown
 
 INTRODUCTION = """# Pitch-axis missile: the reference figures, measured again
 
