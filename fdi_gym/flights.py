@@ -112,6 +112,8 @@ class Flights:
         made = [self._made(s, None if noise is None else noise[number]) for number, s in enumerate(scenarios)]
         if len(where) != len(made):
             raise ValueError(f"one scenario for each of the {len(where)} slots is needed, not {len(made)}")
+        if not made:
+            return
         self.widths[:] = made[0].inputs.reference.shape[1], made[0].inputs.disturbance.shape[1]
         self.k[where], self.status[where], self.x[where], self.c[where] = 0, FLYING, plant.trim_state, plant.c0
         self.u[where], self.theta[where] = plant.trim_command, plant.nominal_theta

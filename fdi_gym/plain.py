@@ -37,6 +37,7 @@ def plain(value: Any, where: str) -> Any:
 
 def _copied(value: Any, depth: int) -> Any:
     kind = type(value)
+    entries: Any = value
     if kind is str or kind is bool or value is None:
         return value
     if kind is float or (kind is int and abs(value) < 2**63):
@@ -50,8 +51,8 @@ def _copied(value: Any, depth: int) -> Any:
         raise _NotPlain(f"lists and dicts within each other {MAX_DEPTH} deep at most are allowed")
     elif kind is not dict and isinstance(value, (list, tuple)):
         return [_entry(v, depth, "[{}]", i) for i, v in enumerate(value)]
-    elif (kind is dict or isinstance(value, Mapping)) and all(isinstance(key, str) for key in value):
-        return {str(key): _entry(v, depth, ".{}", key) for key, v in value.items()}
+    elif (kind is dict or isinstance(value, Mapping)) and all(isinstance(key, str) for key in entries):
+        return {str(key): _entry(v, depth, ".{}", key) for key, v in entries.items()}
     raise _NotPlain(f"strings, finite numbers, lists and dicts of them are allowed, not {reprlib.repr(value)}")
 
 

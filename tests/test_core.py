@@ -11,6 +11,7 @@ from conftest import ROOT, build
 
 from fdi_gym import integration, kernels
 from fdi_gym.discovery import load_plant
+from fdi_gym.drawing import streams
 from fdi_gym.engine import no_noise, simulate, white_noise
 from fdi_gym.faults import (
     Abrupt,
@@ -23,10 +24,9 @@ from fdi_gym.faults import (
     Scoring,
     Square,
     draw,
-    streams,
-    theta_table,
 )
 from fdi_gym.plants import b747_lateral as b747
+from fdi_gym.theta import theta_table
 
 MOTOR = {"reference": {"levels": [100.0]}, "disturbance": {"load": 0.02}}
 

@@ -14,8 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from fdi_gym import evaluation, leaderboard, row, suite, tables, verification
-from fdi_gym import plant as plant_module
+from fdi_gym import discovery, evaluation, leaderboard, row, suite, tables, verification
 from fdi_gym.diagnosis import diagnosers, registry
 from fdi_gym.estimation import data
 from fdi_gym.evaluation import applicable, digests_of, evaluate, settings_of
@@ -426,7 +425,7 @@ fdi_gym.register_plant(ID, "outside_plant:plant")
 
 
 def test_an_edited_plant_outside_the_package_gives_new_rows(rows, modules, monkeypatch):
-    monkeypatch.setattr(plant_module, "_registered", {})
+    monkeypatch.setattr(discovery, "_registered", {})
     file = modules / "outside_plant.py"
 
     def made(text):
