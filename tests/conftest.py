@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdi_gym.diagnosis import filtering, fitting, knowledge
+from fdi_gym.diagnosis import filtering
 from fdi_gym.discovery import load_plant, plant_sources
-from fdi_gym.engine import simulate
 from fdi_gym.estimation.decision import Rule, Verdict
 from fdi_gym.plant import Plant
 
@@ -38,29 +37,6 @@ def b747() -> Plant:
 @pytest.fixture
 def motor() -> Plant:
     return build("DCMotor")
-
-
-SHIPPED = [plant_id for plant_id in PLANTS if (ROOT / "baselines" / "fits" / f"{plant_id}.json").exists()]
-
-
-@pytest.fixture
-def short_calibrations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fits from four flights of at most 100 samples, none of them shipped or kept: for tests that don't count alarms."""
-    real = fitting.flights_of
-
-    def short(plant, process, first, count, faults):
-        scenarios, record = real(plant, process, first, min(count, 4), faults)
-        if first == fitting.FIRST:
-            scenarios = [s.replace(steps=min(s.steps, 100)) for s in scenarios]
-            record = simulate(plant, scenarios)
-        return scenarios, record
-
-    monkeypatch.setattr(fitting, "flights_of", short)
-    monkeypatch.setattr(fitting, "FLIGHTS", 4)
-    monkeypatch.setattr(fitting, "CHANNEL_FLIGHTS", 4)
-    monkeypatch.setattr(knowledge, "_kept", {})
-    monkeypatch.setattr(knowledge, "fits_file", lambda folder, plant_id: None)
-    monkeypatch.setattr(knowledge, "cache_folder", lambda source: None)
 
 
 SILENT = Rule(lambda n: np.zeros(n), lambda s, k, r, informed: (s, Verdict(s > 0, s.astype(int))))

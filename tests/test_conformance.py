@@ -5,7 +5,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import PLANTS, SHIPPED, build
+from conftest import PLANTS, build
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
@@ -61,17 +61,9 @@ def test_made_by_id_in_both_forms(plant_id):
     assert np.array_equal(first, both[0])
 
 
-# On the satellite a fifth of the accuracy is lost.
-HURT_BY_GAPS = {("CMGSatellite", "ascdkf")}
-
-
 @pytest.mark.parametrize("plant_id", PLANTS)
 @pytest.mark.parametrize("name", list(diagnosers()))
-def test_diagnoser(plant_id, name, request):
-    if plant_id not in SHIPPED:
-        request.getfixturevalue("short_calibrations")
-    if (plant_id, name) in HURT_BY_GAPS:
-        request.applymarker(pytest.mark.xfail(strict=True, raises=AssertionError))
+def test_diagnoser(plant_id, name):
     entry = diagnosers()[name]
 
     def make(plant, scenarios):

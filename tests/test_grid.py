@@ -2,7 +2,7 @@
 
 import msgspec
 import pytest
-from conftest import ROOT, SHIPPED
+from conftest import ROOT
 
 from benchmarks.grid import KINDS, PAPER, missing, page, reasons_of, rows_of
 from fdi_gym.diagnosis import diagnosers
@@ -32,10 +32,8 @@ def test_every_pair_has_a_row_or_a_reason_or_is_named_as_missing(family):
 
 
 @pytest.mark.parametrize("family", list(PAPER))
-def test_reasons_are_the_codes_own(family, request):
+def test_reasons_are_the_codes_own(family):
     suite = load_suite(f"{family}-standard")
-    if suite.plant not in SHIPPED:
-        request.getfixturevalue("short_calibrations")
     assert FIGURES["reasons"][suite.name] == reasons_of(suite)
 
 

@@ -38,8 +38,9 @@ def augmented_filter(plant: Plant, aged: Callable[[Array], Array]) -> Filter:
     n_x, n_y, p = len(P_x), len(plant.outputs), len(P_z)
     N, scale = n_x + p, [s.scale for s in (*plant.states, *plant.theta)]
     model = gaussian.bind(plant, scale=scale, entries=range(p), H=np.hstack([linear.C, np.zeros((n_y, p))]))
-    P0, Q = (scipy.linalg.block_diag(x, z) for x, z in ((P_x, P_z), (plant.Q, np.zeros((p, p)))))
-    Q, R, t = Q[None], plant.R[None], np.zeros(1)  # a linear plant knows no time
+    P0 = np.asarray(scipy.linalg.block_diag(P_x, P_z))
+    Q = np.asarray(scipy.linalg.block_diag(plant.Q, np.zeros((p, p))))[None]
+    R, t = plant.R[None], np.zeros(1)  # a linear plant knows no time
 
     def start(n: int) -> AugmentedState:
         S = np.tile(np.eye(n_y), (n, 1, 1))

@@ -72,7 +72,7 @@ def _call(kernel: Any, head: tuple[Any, ...], *arrays: Any) -> None:
         kernel(*head, *arrays)
     except TypeError:
         plain = [contiguous(a) for a in arrays]
-        head = tuple(np.require(a, requirements="CW") if isinstance(a, np.ndarray) else a for a in head)
+        head = tuple(np.require(a, requirements=["C", "W"]) if isinstance(a, np.ndarray) else a for a in head)
         try:
             kernel(*head, *plain)
         except TypeError:
