@@ -3,13 +3,12 @@
 A flight may hold samples and decisions of several labels, and those of one flight are alike: flights are the units,
 samples are not. A suite is drawn by label, so flights are drawn again within strata: those with the same rarest label.
 
-A label's recall is a share, often close to one and seen in thirty flights: its interval is Wilson's (1927) [1], with the
-number of flights' worth of independent answers that the spread between flights says (Korn & Graubard, 1998 [2]; Dean &
-Pagano, 2015 [3]); the labels' intervals add up as Zou & Donner's (2008) [4]. `benchmarks/coverage.py` measures how often
-they hold the truth, beside the percentile bootstrap, which does not.
+A balanced accuracy is a mean of shares, often close to one: its interval is Wilson's (1927) [1], with as many independent
+answers as have the variance that the spread between flights says (Korn & Graubard, 1998 [2]; Dean & Pagano, 2015 [3]), and
+Student's quantile with Satterthwaite's degrees of freedom. `benchmarks/coverage.py` measures how often it holds the truth,
+beside the percentile bootstrap.
 
 [1] J. Am. Stat. Assoc. 22(158):209-212. [2] Survey Methodology 24(2):193-201. [3] J. Surv. Stat. Methodol. 3(4):484-503.
-[4] Statistics in Medicine 27(10):1693-1702.
 """
 
 from __future__ import annotations
@@ -78,15 +77,17 @@ def balanced_interval(hits: Array, counts: Array, stratum: Array) -> list[float]
     share, total, flights = recalls(hits, counts), counts.sum(axis=0), (counts > 0).sum(axis=0)
     influence = (hits - share * counts) / total  # of each flight on each recall
     apart, together = within(influence, stratum), float(within(influence.sum(axis=1), stratum))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        size = np.where((apart > 0) & (share * (1 - share) > 0), share * (1 - share) / apart, flights)
-    quantile = scipy.stats.t.ppf(0.5 + CONFIDENCE / 2, np.maximum(flights - 1, 1))
-    low, high = wilson(share, size, quantile)
-    alike = np.sqrt(max(together / apart.sum(), 1.0)) if apart.sum() > 0 else 1.0  # labels of one flight err together
-    middle, labels = share.mean(), len(share)
-    down = alike * np.sqrt(((share - low) ** 2).sum()) / labels
-    up = alike * np.sqrt(((high - share) ** 2).sum()) / labels
-    return [float(max(middle - down, 0.0)), float(min(middle + up, 1.0))]
+    middle, labels = float(share.mean()), len(share)
+    variance = max(together, float(apart.sum())) / labels**2  # labels of one flight err together, never less than apart
+    if variance > 0 and 0 < middle < 1:
+        size = middle * (1 - middle) / variance
+        freedom = apart.sum() ** 2 / (apart**2 / np.maximum(flights - 1, 1)).sum()  # Satterthwaite's
+    else:  # nothing has varied: as many answers as flights, each label weighing the same
+        size = labels**2 / (1 / flights).sum()
+        freedom = max(flights.min() - 1, 1)
+    quantile = scipy.stats.t.ppf(0.5 + CONFIDENCE / 2, max(freedom, 1.0))
+    low, high = wilson(np.array(middle), np.array(size), quantile)
+    return [float(low), float(high)]
 
 
 def resamples(stratum: Array, count: int, seed: int = 0) -> Array:
