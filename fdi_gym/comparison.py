@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 from fdi_gym.intervals import CONFIDENCE, resamples
 from fdi_gym.metrics import Outcome
@@ -33,7 +33,7 @@ class Drawn(NamedTuple):
         """Score of a less that of b, and its paired 95 % interval."""
         i, j = self.names.index(a), self.names.index(b)
         gap = float(self.score[i] - self.score[j])
-        reach = float(scipy.stats.norm.ppf(0.5 + CONFIDENCE / 2) * np.std(self.again[:, i] - self.again[:, j]))
+        reach = float(scipy.special.ndtri(0.5 + CONFIDENCE / 2) * np.std(self.again[:, i] - self.again[:, j]))
         return gap, gap - reach, gap + reach
 
     def p_values(self) -> Array:
@@ -41,7 +41,7 @@ class Drawn(NamedTuple):
         gap = self.score[:, None] - self.score
         spread = np.array([np.std(self.again - column[:, None], axis=0) for column in self.again.T])
         with np.errstate(invalid="ignore", divide="ignore"):
-            p = 2 * scipy.stats.norm.sf(np.abs(gap) / spread)
+            p = 2 * scipy.special.ndtr(-np.abs(gap) / spread)
         return np.where(np.abs(gap) < 1e-12, 1.0, np.where(spread < 1e-12, 0.0, p))
 
 

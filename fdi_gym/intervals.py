@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 from fdi_gym.plant import Array
 
@@ -85,7 +85,7 @@ def balanced_interval(hits: Array, counts: Array, stratum: Array) -> list[float]
     else:  # nothing has varied: as many answers as flights, each label weighing the same
         size = labels**2 / (1 / flights).sum()
         freedom = max(flights.min() - 1, 1)
-    quantile = scipy.stats.t.ppf(0.5 + CONFIDENCE / 2, max(freedom, 1.0))
+    quantile = scipy.special.stdtrit(max(freedom, 1.0), 0.5 + CONFIDENCE / 2)
     low, high = wilson(np.array(middle), np.array(size), quantile)
     return [float(low), float(high)]
 

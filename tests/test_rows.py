@@ -486,7 +486,7 @@ def test_settings_in_a_row_are_what_the_builder_got(monkeypatch):
         got.update(settings)
         return entry.build(plant, **settings)
 
-    monkeypatch.setitem(registry._entries, "three_stage_cdkf", entry._replace(build=build))
+    monkeypatch.setitem(registry._entries["diagnoser"], "three_stage_cdkf", entry._replace(build=build))
     plant = frozen.build()
     applicable(frozen, plant, ["three_stage_cdkf"])
     knowledge = {name: data.digest(got.pop(name)) for name in ("belief", "calibration")}
