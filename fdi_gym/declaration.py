@@ -92,18 +92,19 @@ def _members(plant: Plant) -> list[Array]:
     return [np.array([k for k, said in enumerate(plant.labels) if mode.name in said.modes], int) for mode in plant.modes]
 
 
+def true_rows(plant: Plant, label: Array, target: Array) -> Array:
+    """What was true of one flight (modes, 4), from its labels (K + 1,) and estimated quantity (K + 1, n)."""
+    return _windows_to_rows(plant, _runs_of(label, _members(plant)), label, _deviation(plant, target))
+
+
 def true_declaration(plant: Plant, record: Record) -> Array:
     """What was true of recorded flights: (N, modes, 4), the columns PRESENT, ONSET, END, SIZE.
 
     Onset and end are steps: a fault acts on onset <= k < end, from the first time to the last. The size is that on the
     mode's line, the median over the second half of the time in which it acted.
     """
-    members = _members(plant)
-    rows = []
-    for label, target, length in zip(record.label, record.target, record.length, strict=True):
-        flown = label[: length + 1]
-        rows.append(_windows_to_rows(plant, _runs_of(flown, members), flown, _deviation(plant, target[: length + 1])))
-    return np.array(rows)
+    flights = zip(record.label, record.target, record.length, strict=True)
+    return np.array([true_rows(plant, label[: last + 1], target[: last + 1]) for label, target, last in flights])
 
 
 def alarms(label: Array) -> list[tuple[int, int]]:
@@ -116,6 +117,23 @@ def alarms(label: Array) -> list[tuple[int, int]]:
         else:
             joined.append((first, last))
     return [(a, b) for a, b in joined if b - a >= SHORTEST]
+
+
+def declared_rows(plant: Plant, label: Array, estimate: Array | None) -> Array:
+    """What a diagnoser's labels (K + 1,) and estimates (K + 1, n) over one flight amount to (modes, 4); see `declared`."""
+    windows: dict[int, list[tuple[int, int]]] = {}
+    members = _members(plant)
+    for first, after in alarms(label):
+        enough = min(SHARE * (after - first), max(SHORTEST, LASTING * len(label)))
+        named: dict[int, tuple[int, int]] = {}
+        for i, labels in enumerate(members):
+            found = first + np.flatnonzero(np.isin(label[first:after], labels))
+            if len(found) >= enough:
+                named[i] = int(found[0]), int(found[-1]) + 1
+        earliest = min((begin for begin, _ in named.values()), default=first)
+        for i, (begin, end) in named.items():
+            windows.setdefault(i, []).append((first if begin == earliest else begin, end))
+    return _windows_to_rows(plant, windows, label, None if estimate is None else _deviation(plant, estimate))
 
 
 def declared(plant: Plant, said: Decisions, length: Array) -> Array:
@@ -131,23 +149,10 @@ def declared(plant: Plant, said: Decisions, length: Array) -> Array:
         said: What the diagnoser said.
         length: (N,) last sample of each flight.
     """
-    members, rows = _members(plant), []
-    for n, last in enumerate(length):
-        label = said.label[n, : last + 1].astype(np.int64)
-        windows: dict[int, list[tuple[int, int]]] = {}
-        for first, after in alarms(label):
-            enough = min(SHARE * (after - first), max(SHORTEST, LASTING * len(label)))
-            named: dict[int, tuple[int, int]] = {}
-            for i, labels in enumerate(members):
-                found = first + np.flatnonzero(np.isin(label[first:after], labels))
-                if len(found) >= enough:
-                    named[i] = int(found[0]), int(found[-1]) + 1
-            earliest = min((begin for begin, _ in named.values()), default=first)
-            for i, (begin, end) in named.items():
-                windows.setdefault(i, []).append((first if begin == earliest else begin, end))
-        estimate = None if said.estimate is None else _deviation(plant, said.estimate[n, : last + 1])
-        rows.append(_windows_to_rows(plant, windows, label, estimate))
-    return np.array(rows)
+    return np.array([
+        declared_rows(plant, said.label[n, : last + 1], None if said.estimate is None else said.estimate[n, : last + 1])
+        for n, last in enumerate(length)
+    ])  # fmt: skip
 
 
 def errors(plant: Plant, truth: Array, declaration: Array) -> Errors:

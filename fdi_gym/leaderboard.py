@@ -30,7 +30,7 @@ Rendered by `fdi-gym leaderboard` from the rows in `results/`; a test renders it
 `fdi-gym verify leaderboards/results/<suite>/<row>.json`.
 
 A suite has at least 30 decisions about every label (papers' suites: about those that the paper's scenario has). There is
-one decision about each window of a fault, and one about each healthy flight. Three tasks are ranked, each by its own figure:
+one decision about each window of a fault, and one about each healthy flight. Four tasks are ranked, each by its own figure:
 
 - **Isolation**: balanced accuracy, the mean over the labels of the share of right answers, in percent, per sample (outside
   the grace after a change) and per decision. Raw accuracy never ranks: often "always none" is right most of the time.
@@ -42,6 +42,10 @@ one decision about each window of a fault, and one about each healthy flight. Th
 - **Identification**, while a fault acts: the error relative to that of always estimating "healthy" (1), 0 is perfect; the
   share of errors within 1.96 of the stated deviations (95 % if they are right); NEES per entry (1 if they are right); the
   root mean square error of each entry with its unit.
+- **Scenario**: what labels and estimates amount to as one declaration of the whole flight, 0 for a wrong set of faults, else
+  the mean of 1, the overlap of the windows and 1 less the error of the size as a share of its reach. Beside it the share of
+  flights with the right set of faults, and for faults that are both true and declared the onset's error (median and
+  quartiles), the windows' overlap and the size's median error.
 
 Delays in seconds: mean, if longer ones count as the median length of a fault, then median (quartiles), right-censored where
 never reached. Faults that begin under an alarm, or with their label declared already, are left out.

@@ -15,6 +15,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
+from fdi_gym.declaration import PRESENT, declared_rows, errors, spans, true_rows, worth
 from fdi_gym.diagnosis import Decisions
 from fdi_gym.engine import Record
 from fdi_gym.faults import Scoring
@@ -61,6 +62,23 @@ class Stated(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     squares: float  # sum of (error / deviation)^2
 
 
+class Found(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How a fault mode that a flight had was declared, as in `fdi_gym.declaration.errors`."""
+
+    onset: int  # declared less true, in samples
+    overlap: float  # of the two windows, as a share of their union
+    size: float  # declared less true, as a share of the mode's reach
+
+
+class Declaration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the diagnosis amounts to as one declaration of the whole flight."""
+
+    modes: Count  # that the flight had
+    exact: bool  # they are those that are declared
+    worth: float  # 0 to 1
+    found: list[Found]  # of the modes that are both
+
+
 class Outcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One episode, reduced to counts."""
 
@@ -78,6 +96,7 @@ class Outcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     squared_error: list[list[float]]  # per phase: sum over samples, per estimated entry
     error_steps: list[Count]  # per phase
     squared_fault: list[float]  # while a fault acts: sum of squared deviations of the truth from healthy, per entry
+    declaration: Declaration
     stated: list[Stated] | None  # per estimated entry, where the method states deviations
     log_score: float | None  # sum of log probabilities of the true label over scored samples, where there are any
 
@@ -121,11 +140,18 @@ def check_outcomes(outcomes: Sequence[Outcome], labels: int, entries: int) -> No
             "a delay of what was there before": any(((o.alarmed or not o.fresh) and o.detection is not None)
                                                     or (o.labelled and o.isolation is not None) for o in episode.onsets),
             "sums of squares that no error has": any(not 0 <= value < 1e300 for value in sums),
+            "a declaration that cannot be": not _possible(episode.declaration, episode.steps),
             "a log score above 0": episode.log_score is not None and not -1e300 < episode.log_score <= 1e-6,
         }  # fmt: skip
         for what, is_so in wrong.items():
             if is_so:
                 raise ValueError(f"episode {i} has {what}")
+
+
+def _possible(said: Declaration, steps: int) -> bool:
+    within = all(abs(f.onset) <= steps and 0 <= f.overlap <= 1 and abs(f.size) < 1e12 for f in said.found)
+    whole = len(said.found) <= said.modes and (len(said.found) == said.modes or not said.exact)
+    return within and whole and 0 <= said.worth <= 1 and (said.exact or said.worth == 0)
 
 
 def scored_samples(label: Array, length: int, scoring: Scoring) -> Array:
@@ -198,6 +224,18 @@ def _stated(error: Array, std: Array, during: Array) -> list[Stated]:
     return found
 
 
+def _declaration(plant: Plant, label: Array, target: Array, said: Array, estimate: Array | None) -> Declaration:
+    """Of one flight, from its samples 0..length."""
+    truth, declared = true_rows(plant, label, target)[None], declared_rows(plant, said, estimate)[None]
+    wrong, span = errors(plant, truth, declared), spans(plant)
+    both = np.flatnonzero(np.isfinite(wrong.onset[0]))
+    return Declaration(
+        int(truth[0, :, PRESENT].sum()), bool(wrong.exact[0]), float(worth(plant, truth, declared)[0]),
+        [Found(int(wrong.onset[0, i]), float(wrong.overlap[0, i]), float(wrong.size[0, i] / span[i] if span[i] else 0.0))
+         for i in both],
+    )  # fmt: skip
+
+
 def outcome(plant: Plant, scoring: Scoring, record: Record, said: Decisions, i: int) -> Outcome:
     """Reduce episode i of a record, and what was said about it, to counts."""
     length = int(record.length[i])
@@ -225,6 +263,9 @@ def outcome(plant: Plant, scoring: Scoring, record: Record, said: Decisions, i: 
         moved = [float(v) for v in ((record.target[i] - nominal)[phase == 1] ** 2).sum(axis=0)]
         if said.estimate_std is not None:
             stated = _stated(error, said.estimate_std[i], phase == 1)
+    flight = slice(length + 1)
+    estimate = None if said.estimate is None else said.estimate[i, flight]
+    declaration = _declaration(plant, label[flight], record.target[i, flight], mode[flight], estimate)
     log_score = None
     if said.label_probs is not None:
         log_score = float(np.log(np.maximum(said.label_probs[i, scored, label[scored]], 1e-12)).sum())
@@ -240,5 +281,6 @@ def outcome(plant: Plant, scoring: Scoring, record: Record, said: Decisions, i: 
         false_alarms=int((alarm & ~before & healthy).sum()), healthy_steps=int(healthy.sum()),
         alarm_steps=int((alarm & healthy).sum()),
         alarmed=[(int((scored & kind).sum()), int((scored & kind & alarm).sum())) for kind in (label == 0, label > 0)],
-        squared_error=squares, error_steps=steps, squared_fault=moved, stated=stated, log_score=log_score,
+        squared_error=squares, error_steps=steps, squared_fault=moved, stated=stated, declaration=declaration,
+        log_score=log_score,
     )  # fmt: skip

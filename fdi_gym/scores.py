@@ -156,6 +156,21 @@ def _identification(outcomes: Sequence[Outcome], entries: Sequence[str]) -> dict
     }
 
 
+def _scenario(outcomes: Sequence[Outcome], dt: float) -> dict[str, Any]:
+    """Of the declarations of whole flights. Errors are those of the modes that are both true and declared."""
+    said = [flight.declaration for flight in outcomes]
+    found = [f for one in said for f in one.found]
+    onsets = np.abs([f.onset for f in found]) * dt
+    return {
+        "worth": float(np.mean([one.worth for one in said])),
+        "exact": float(np.mean([one.exact for one in said])),
+        "found": float(len(found) / modes) if (modes := sum(one.modes for one in said)) else None,
+        "onset_error_quartiles": np.quantile(onsets, (0.25, 0.5, 0.75)).tolist() if found else None,
+        "overlap": float(np.mean([f.overlap for f in found])) if found else None,
+        "size_error": float(np.median(np.abs([f.size for f in found]))) if found else None,
+    }
+
+
 def summarise(outcomes: Sequence[Outcome], labels: int, entries: Sequence[str], dt: float) -> dict[str, Any]:
     """The scores of a set of flights, from their outcomes alone.
 
@@ -165,6 +180,9 @@ def summarise(outcomes: Sequence[Outcome], labels: int, entries: Sequence[str], 
     stated deviations (0.95 if they are right) and by the mean of (error / deviation)^2 (NEES per entry, 1 if right). Delays
     leave out faults that began under an alarm, or with their label declared; the restricted mean counts what is longer
     than the median fault as the median fault.
+
+    The scenario task is scored on what the labels and estimates amount to as one declaration of each flight
+    (`fdi_gym.declaration`).
 
     Args:
         outcomes: One per flight.
@@ -193,6 +211,7 @@ def summarise(outcomes: Sequence[Outcome], labels: int, entries: Sequence[str], 
         },
         "detection": _detection(outcomes, stratum, dt),
         "identification": _identification(outcomes, entries),
+        "scenario": _scenario(outcomes, dt),
         "log_score": float(sum(s for s, _ in scored) / samples) if samples else None,
         "lost_episodes": sum(flight.lost for flight in outcomes),
         "terminated_episodes": sum(flight.terminated for flight in outcomes),

@@ -91,6 +91,10 @@ def _delay(found: Mapping[str, Any], what: str) -> str:
     return f"{mean:.1f}; " + ("never" if low == "never" else f"{middle} ({low}, {high})")
 
 
+def _middle(quartiles: Sequence[float] | None) -> str:
+    return "-" if quartiles is None else f"{quartiles[1]:.2f} ({quartiles[0]:.2f}, {quartiles[2]:.2f})"
+
+
 def _score(found: Mapping[str, Any]) -> str:
     return _percent(found["balanced_accuracy"], found["balanced_accuracy_interval"])
 
@@ -127,11 +131,17 @@ COLUMNS: dict[str, tuple[str, Callable[[Line], str]]] = {
     "error": ("relative error", _estimated("relative_error", 3)),
     "coverage": ("covered %", _estimated("coverage", 1, 100.0)),
     "nees": ("NEES", _estimated("nees", 2)),
+    "worth": ("scenario %", lambda a: _percent(a.row.metrics["scenario"]["worth"])),
+    "exact": ("right faults %", lambda a: _percent(a.row.metrics["scenario"]["exact"])),
+    "onset": ("onset error s", lambda a: _middle(a.row.metrics["scenario"]["onset_error_quartiles"])),
+    "overlap": ("overlap %", lambda a: _percent(a.row.metrics["scenario"]["overlap"])),
+    "size": ("size error %", lambda a: _percent(a.row.metrics["scenario"]["size_error"])),
     "time": ("us/sample", lambda a: _number(a.microseconds, 1)),
 }
 ISOLATION = ("tied", "sample", "decision", "severity", "isolated", "log", "time")
 DETECTION = ("detection", "alarms", "under", "begun", "missed", "detected")
 IDENTIFICATION = ("error", "coverage", "nees")
+SCENARIO = ("worth", "exact", "onset", "overlap", "size")
 
 
 def isolates(row: Row) -> bool:
@@ -164,10 +174,17 @@ def by_identification(rows: Sequence[Row]) -> list[Row]:
     return _ranked(shown, lambda row: -(row.metrics["identification"]["relative_error"] or 0.0))
 
 
+def by_scenario(rows: Sequence[Row]) -> list[Row]:
+    """Those that isolate, and what frames them, the worthiest declarations of whole flights first."""
+    shown = [row for row in rows if isolates(row) or _framed(row)]
+    return _ranked(shown, lambda row: row.metrics["scenario"]["worth"])
+
+
 RANKINGS: dict[str, tuple[Callable[[Sequence[Row]], list[Row]], tuple[str, ...]]] = {
     "Isolation": (by_isolation, ISOLATION),
     "Detection": (by_detection, DETECTION),
     "Identification": (by_identification, IDENTIFICATION),
+    "Scenario": (by_scenario, SCENARIO),
 }
 
 

@@ -7,7 +7,7 @@ import scipy.stats
 from fdi_gym.comparison import cliques, draw_again, holm, tied_with_best
 from fdi_gym.diagnosis import diagnoser
 from fdi_gym.intervals import balanced_interval, wilson
-from fdi_gym.metrics import Decision, Outcome
+from fdi_gym.metrics import Decision, Declaration, Outcome
 from fdi_gym.tables import by_identification, by_isolation, isolates
 
 LABELS, FLIGHTS = 3, 90
@@ -21,6 +21,7 @@ def flight(label, share, samples=100):
     return Outcome(steps=samples, terminated=False, lost=False, decisions=[Decision(label, declared, 0 if label else None)],
                    confusion=confusion, banded=[(0, 0)] * 3, onsets=[], false_alarms=0, healthy_steps=0, alarm_steps=0,
                    alarmed=[(0, 0)] * 2, squared_error=[[0.0]] * 3, error_steps=[0] * 3, squared_fault=[0.0], stated=None,
+                       declaration=Declaration(0, True, 1.0, []),
                    log_score=None)  # fmt: skip
 
 

@@ -50,7 +50,7 @@ class Single:
     """One environment; every call is also made on a twin that is a copy of it."""
 
     def __init__(self, plant, rng):
-        task = ["isolation", "identification"][rng.integers(2)]
+        task = list(TASKS)[rng.integers(len(TASKS))]
         self.plant, self.env = plant, FDIEnv(plant.id, task=task, decision_period=int(rng.choice([1, 3])))
 
     def calls(self, rng, several=False):
@@ -69,7 +69,7 @@ class Many(Single):
     """Vector environments in all autoreset modes."""
 
     def __init__(self, plant, rng):
-        task = ["isolation", "identification"][rng.integers(2)]
+        task = list(TASKS)[rng.integers(len(TASKS))]
         mode = list(AutoresetMode)[rng.integers(3)]
         period = int(rng.choice([1, 3]))
         self.plant, self.env = plant, FDIVectorEnv(plant.id, N, task, decision_period=period, autoreset_mode=mode)

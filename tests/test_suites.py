@@ -51,6 +51,7 @@ def test_the_truth_scores_one_and_null_scores_chance(name):
     assert (detection["balanced_accuracy"], detection["missed_rate"], detection["false_alarms_per_hour"]) == (1.0, 0.0, 0.0)
     assert detection["delay_quartiles"] == pytest.approx([plant.dt] * 3)
     assert detection["delay_restricted_mean"] == pytest.approx(plant.dt)
+    assert (truth["scenario"]["exact"], truth["scenario"]["onset_error_quartiles"]) == (1.0, [0.0] * 3)
     silent = np.zeros_like(record.label)
     null = scores(plant, suite.process, record, Decisions(silent > 0, silent, None, None, None))
     for kind in ("per_sample", "per_decision"):
@@ -60,6 +61,7 @@ def test_the_truth_scores_one_and_null_scores_chance(name):
         assert null[kind]["balanced_accuracy_interval"] == pytest.approx([chance, chance])
         if name in DRAWN:
             assert chance == pytest.approx(1 / len(plant.labels))
+    assert null["scenario"]["exact"] == null["scenario"]["worth"] == (record.label == 0).all(axis=1).mean()
     assert null["detection"]["balanced_accuracy"] == 0.5
     assert null["detection"]["missed_rate"] == 1.0
 
