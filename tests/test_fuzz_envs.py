@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 from fdi_gym.envs import FDIEnv
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.sb3 import FDIVecEnv
+from fdi_gym.tasks import TASKS
 from fdi_gym.vector_envs import FDIVectorEnv
 
 N = 3
