@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi_gym.checks import check_declaration, check_scenario, twice, unknown
-from fdi_gym.faults import FaultProcess, FaultScenario
+from fdi_gym.faults import FaultProcess, FaultScenario, draw
 from fdi_gym.model import Array, Model, contiguous
 from fdi_gym.shapes import OPEN, Shapes
 from fdi_gym.theta import ThetaTable, theta_table
@@ -313,6 +313,11 @@ class Plant(Model):
         return tuple(s.name for s in self.commands)
 
     @functools.cached_property
+    def mode_names(self) -> tuple[str, ...]:
+        """Names of the fault modes, in order."""
+        return tuple(mode.name for mode in self.modes)
+
+    @functools.cached_property
     def _label_index(self) -> dict[frozenset[str], int]:
         return {frozenset(label.modes): index for index, label in enumerate(self.labels)}
 
@@ -330,11 +335,13 @@ class Plant(Model):
 
     def label_intervals(self, scenario: FaultScenario) -> Iterator[tuple[int, int, frozenset[str]]]:
         """The flight's intervals (first step, end step, active modes) between the changes of the set of active modes."""
-        ends = [scenario.steps if f.end is None else min(f.end, scenario.steps) for f in scenario.faults]
-        edges = sorted({0, scenario.steps, *(min(f.onset, scenario.steps) for f in scenario.faults), *ends})
-        for start, stop in itertools.pairwise(edges):
-            active = (f.mode for f, end in zip(scenario.faults, ends, strict=True) if f.onset <= start < end)
-            yield start, stop, frozenset(active)
+        steps = scenario.steps
+        windows = [(f.onset, steps if f.end is None else min(f.end, steps), f.mode) for f in scenario.faults]
+        edges = {0, steps}
+        for onset, end, _ in windows:
+            edges |= {min(onset, steps), end}
+        for start, stop in itertools.pairwise(sorted(edges)):
+            yield start, stop, frozenset([mode for onset, end, mode in windows if onset <= start < end])
 
     def label_rows(self, scenario: FaultScenario) -> Array:
         """The true label at the samples 0..K: sample k has that of the fault which acted over [k - 1, k)."""
@@ -375,7 +382,13 @@ class Plant(Model):
         p = self.nominal_p
         if scenario.physical:
             p = self._made("physical", lambda s: self.physical(s.physical), scenario, p.shape)
-        return Inputs(self._made("reference", self.reference, scenario, (rows, None)), d, p)
+        return Inputs(self._made("reference", self.reference, scenario, (rows, self.reference_width)), d, p)
+
+    @functools.cached_property
+    def reference_width(self) -> int:
+        """Columns of the reference rows, as of a standard flight; a scenario that makes others is refused."""
+        scenario = draw(self.process("standard"), 0)
+        return self._made("reference", self.reference, scenario, (scenario.steps + 1, None)).shape[1]
 
     def _made(self, name: str, make: Callable[[FaultScenario], Array], scenario: FaultScenario, shape: tuple) -> Array:
         try:
@@ -383,7 +396,7 @@ class Plant(Model):
         except Exception as error:  # whatever the plant's author did not think of
             what = f"{type(error).__name__}: {error}"
             raise ValueError(f"{name} of a {self.id} scenario, {reprlib.repr(getattr(scenario, name))}: {what}") from error
-        fits = made.ndim == len(shape) and all(n in (m, None) for m, n in zip(made.shape, shape, strict=True))
+        fits = made.shape == shape or (shape[-1] is None and made.shape[:-1] == shape[:-1])
         given = contiguous(made[:1] if fits and made.ndim == 2 and made.strides[0] == 0 else made)  # one row, broadcast
         if not fits or not np.isfinite(given).all():
             raise ValueError(
