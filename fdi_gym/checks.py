@@ -14,7 +14,8 @@ from fdi_gym import shapes
 from fdi_gym.faults import Abrupt, Effect, FaultProcess, FaultScenario, Hold, Incipient, Intermittent, Samples, Square
 
 if TYPE_CHECKING:
-    from fdi_gym.plant import FaultMode, Plant, Signal
+    from fdi_gym.data_sheet import FaultMode, Signal
+    from fdi_gym.plant import Plant
 
 X0_RANGES = 10.0  # an initial state lies within so many times its declared range
 

@@ -11,7 +11,8 @@ from fdi_gym import closed_loop
 from fdi_gym.closed_loop import FLYING, OVER, TERMINATED
 from fdi_gym.faults import Abrupt, FaultScenario, Hold, Incipient, Intermittent, Samples, Square
 from fdi_gym.model import contiguous
-from fdi_gym.plant import Inputs, Plant
+from fdi_gym.plant import Plant
+from fdi_gym.truth import Inputs
 
 Array = np.ndarray
 

@@ -26,6 +26,7 @@ from __future__ import annotations
 import ast
 import functools
 import hashlib
+import importlib
 import inspect
 import os
 import pickle
@@ -227,6 +228,23 @@ def compiled(signature: Any) -> Callable[[Any], Any]:
         return call
 
     return decorate
+
+
+class Sent:
+    """A kernel under way to another process: by its name where it has one, else by its source; compiled there."""
+
+    def __init__(self, dispatcher: Any):
+        self.dispatcher = dispatcher
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        function = self.dispatcher.py_func
+        if getattr(sys.modules.get(function.__module__), function.__name__, None) is self.dispatcher:
+            return _arrived, (function.__module__, function.__name__)
+        return kernel, (function,)
+
+
+def _arrived(module: str, name: str) -> Any:
+    return getattr(importlib.import_module(module), name)
 
 
 # ---------------------------------------------------------------------------------------------------------------
