@@ -14,7 +14,8 @@ from fdi_gym import shapes
 from fdi_gym.faults import Abrupt, Effect, FaultProcess, FaultScenario, Hold, Incipient, Intermittent, Samples, Square
 
 if TYPE_CHECKING:
-    from fdi_gym.plant import FaultMode, Plant, Signal
+    from fdi_gym.data_sheet import FaultMode, Signal
+    from fdi_gym.plant import Plant
 
 X0_RANGES = 10.0  # an initial state lies within so many times its declared range
 
@@ -159,14 +160,14 @@ def check_scenario(plant: Plant, scenario: FaultScenario) -> None:
         raise ValueError(f"the scenario belongs to {scenario.plant}, not to {plant.id}")
     if scenario.x0 is not None:
         _check_state(plant, scenario.x0)
-    modes = {mode.name for mode in plant.modes}
     for i, fault in enumerate(scenario.faults):
-        if fault.mode not in modes:
-            raise ValueError(f"faults[{i}]: no fault mode {fault.mode!r}; {plant.id} has {', '.join(sorted(modes))}")
+        if fault.mode not in plant.mode_names:
+            raise ValueError(
+                f"faults[{i}]: no fault mode {fault.mode!r}; {plant.id} has {', '.join(sorted(plant.mode_names))}"
+            )
         for effect in fault.effects:
             _check_effect(plant, f"faults[{i}]", effect)
-    for _, _, active in plant.label_intervals(scenario):
-        plant.label_of(active)
+    plant.label_changes(scenario)  # there is a label for each set of modes that are active at once
     for name in ("reference", "disturbance", "physical"):
         shape = getattr(plant.shapes, name)
         if shape is not None:

@@ -7,13 +7,15 @@ truth, `declared` of what any diagnoser said over the flight, `errors` compares 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from fdi_gym.diagnosis.contract import Decisions
 from fdi_gym.engine import Record
 from fdi_gym.plant import Array, Plant
+
+if TYPE_CHECKING:  # an environment begins without the filters' modules
+    from fdi_gym.diagnosis.contract import Decisions
 
 PRESENT, ONSET, END, SIZE, COLUMNS = range(5)  # of a declaration's rows
 BRIDGED = 20  # samples without an alarm that do not end it, as of an intermittent fault

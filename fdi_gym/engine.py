@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -99,7 +99,7 @@ def advance(
         )
     arguments = (
         *plant.addresses, plant.dt, plant.substeps, int(plant.true_feedback), plant.nominal_theta, contiguous(plant.q),
-        *_signals(flights), *flights.arrays(),
+        *flights.signals, *flights.arrays(),
     )  # fmt: skip
 
     def fly(block: Array) -> None:
@@ -107,12 +107,11 @@ def advance(
 
     most = numba.config.NUMBA_NUM_THREADS if threads is None else threads  # type: ignore[attr-defined]
     parts = max(1, min(most, len(slots), len(slots) * samples // WORTH_A_THREAD))
-    blocks = [block for block in np.array_split(slots, parts) if block.size]
-    if len(blocks) > 1:
-        with ThreadPoolExecutor(len(blocks)) as pool:
-            list(pool.map(fly, blocks))
-    elif blocks:
-        fly(blocks[0])
+    if parts > 1:
+        with ThreadPoolExecutor(parts) as pool:
+            list(pool.map(fly, np.array_split(slots, parts)))
+    else:
+        fly(slots)
     return chunk
 
 
@@ -123,15 +122,6 @@ def _optional(name: str, table: Array | None, shape: tuple[int, ...]) -> Array:
     if table.shape != shape or not np.isfinite(table).all():
         raise ValueError(f"{name} is finite and has the shape {shape}, not {table.shape}")
     return table
-
-
-def _signals(flights: Flights) -> tuple[Any, ...]:
-    """What the compiled call needs of the plant's data sheet."""
-    plant = flights.plant
-    boxes = [np.array([[s.low for s in signals], [s.high for s in signals]], float).reshape(2, -1)
-             for signals in (plant.outputs, plant.commands)]  # fmt: skip
-    sigma = np.array([s.sigma for s in (*plant.outputs, *plant.states)])
-    return *boxes, sigma, plant.noise_limit, flights.widths
 
 
 def simulate(

@@ -11,11 +11,12 @@ from fdi_gym import closed_loop
 from fdi_gym.closed_loop import FLYING, OVER, TERMINATED
 from fdi_gym.faults import Abrupt, FaultScenario, Hold, Incipient, Intermittent, Samples, Square
 from fdi_gym.model import contiguous
-from fdi_gym.plant import Inputs, Plant
+from fdi_gym.plant import Plant
+from fdi_gym.truth import Inputs
 
 Array = np.ndarray
 
-NEVER = np.int64(2**62)  # a sample that does not come
+NEVER = 2**62  # a sample that does not come
 
 
 class Chunk(NamedTuple):
@@ -33,6 +34,14 @@ class _Made(NamedTuple):
     inputs: Inputs
     labels: list[tuple[int, int]]
     noise: tuple[Array | None, Array | None]
+
+
+def _signals(plant: Plant) -> tuple[Any, ...]:
+    """What the compiled call needs of the plant's data sheet."""
+    boxes = [np.array([[s.low for s in signals], [s.high for s in signals]], float).reshape(2, -1)
+             for signals in (plant.outputs, plant.commands)]  # fmt: skip
+    sigma = np.array([s.sigma for s in (*plant.outputs, *plant.states)])
+    return *boxes, sigma, plant.noise_limit, np.array([plant.reference_width, len(plant.disturbances)], np.int64)
 
 
 class Flights:
@@ -75,7 +84,7 @@ class Flights:
         self.addresses = np.zeros((4, n), np.int64)
         self.steps = np.ones((2, n), np.int64)  # from a sample's row of reference and disturbance to the next; 0: one row
         self.values = np.zeros((n, 1), np.int64)
-        self.widths = np.zeros(2, np.int64)  # of reference and disturbance
+        self.signals = _signals(plant)
         self.begin(range(n), scenarios, noise)
 
     def __len__(self) -> int:
@@ -114,7 +123,6 @@ class Flights:
             raise ValueError(f"one scenario for each of the {len(where)} slots is needed, not {len(made)}")
         if not made:
             return
-        self.widths[:] = made[0].inputs.reference.shape[1], made[0].inputs.disturbance.shape[1]
         self.k[where], self.status[where], self.x[where], self.c[where] = 0, FLYING, plant.trim_state, plant.c0
         self.u[where], self.theta[where] = plant.trim_command, plant.nominal_theta
         self.length[where] = [scenario.steps for scenario in scenarios]
@@ -175,18 +183,16 @@ class Flights:
                     self.held[i, e] = plant.trim_command[row[5]]
         return samples
 
-    def _set_labels(self, i: int, changes: Sequence[tuple[int, int]]) -> None:
+    def _set_labels(self, i: int, changes: list[tuple[int, int]]) -> None:
         if len(changes) >= self.labels.shape[1]:
             more = len(changes) + 1 - self.labels.shape[1]
             self.labels = np.pad(self.labels, ((0, 0), (0, more), (0, 0)), constant_values=NEVER)
-        self.labels[i, : len(changes)] = changes
-        self.labels[i, len(changes) :] = NEVER
+        self.labels[i] = changes + [(NEVER, NEVER)] * (self.labels.shape[1] - len(changes))
 
     def _point(self, i: int) -> None:
         """Note where flight i's tables lie; they live as long as this does."""
         *tables, samples = self.tables[i]
-        for column, table in enumerate(tables):
-            self.addresses[column, i] = 0 if table is None else table.__array_interface__["data"][0]
+        self.addresses[:, i] = [0 if table is None else table.__array_interface__["data"][0] for table in tables]
         for e, table in samples.items():
             self.values[i, e] = table.__array_interface__["data"][0]
 

@@ -26,12 +26,13 @@ from __future__ import annotations
 import ast
 import functools
 import hashlib
+import importlib
 import inspect
 import os
 import pickle
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -62,23 +63,37 @@ _ROLES = {
 def sources(path: Path) -> tuple[Path, ...]:
     """A source file and those of the package that it imports, directly or not: what its kernels can depend on."""
     found, todo = set(), [path.resolve()]
-    root = Path(__file__).resolve().parent
     while todo:
         here = todo.pop()
-        if here in found:
-            continue
-        found.add(here)
-        for node in ast.walk(ast.parse(here.read_bytes())):
-            names = []
-            if isinstance(node, ast.ImportFrom) and node.module:
-                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-            elif isinstance(node, ast.Import):
-                names = [alias.name for alias in node.names]
-            for name in names:
-                package, *rest = name.split(".")
-                if package == root.name and (file := root.joinpath(*rest).with_suffix(".py")).is_file():
-                    todo.append(file)
+        if here not in found:
+            found.add(here)
+            todo += _imported(here)
     return tuple(sorted(found))
+
+
+@functools.cache
+def _imported(path: Path) -> tuple[Path, ...]:
+    """The files of the package that a source file imports."""
+    root, files = Path(__file__).resolve().parent, set()
+    for node in _statements(ast.parse(path.read_bytes()).body):
+        names = []
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        for name in names:
+            package, *rest = name.split(".")
+            if package == root.name and (file := root.joinpath(*rest).with_suffix(".py")).is_file():
+                files.add(file)
+    return tuple(files)
+
+
+def _statements(body: Iterable[ast.AST]) -> Iterator[ast.AST]:
+    """The statements of a body and of those within it; not their expressions, which import nothing."""
+    for node in body:
+        yield node
+        for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+            yield from _statements(getattr(node, part, ()))
 
 
 _signatures: dict[Any, Any] = {}  # of the kernels, compiled when they are first needed
@@ -213,6 +228,23 @@ def compiled(signature: Any) -> Callable[[Any], Any]:
         return call
 
     return decorate
+
+
+class Sent:
+    """A kernel under way to another process: by its name where it has one, else by its source; compiled there."""
+
+    def __init__(self, dispatcher: Any):
+        self.dispatcher = dispatcher
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        function = self.dispatcher.py_func
+        if getattr(sys.modules.get(function.__module__), function.__name__, None) is self.dispatcher:
+            return _arrived, (function.__module__, function.__name__)
+        return kernel, (function,)
+
+
+def _arrived(module: str, name: str) -> Any:
+    return getattr(importlib.import_module(module), name)
 
 
 # ---------------------------------------------------------------------------------------------------------------

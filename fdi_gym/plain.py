@@ -6,11 +6,23 @@ import math
 import re
 import reprlib
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 MAX_DEPTH = 16  # of lists and dicts within each other
+
+_NUMBER = Annotated[int, Meta(ge=1 - 2**63, le=2**63 - 1)] | Annotated[float, Meta(ge=-1e300, le=1e300)]
+_LEAF = str | bool | None | _NUMBER
+_INNER = _LEAF | list[_LEAF] | dict[str, _LEAF]
+
+
+class _Usual(msgspec.Struct):
+    """What the usual dict holds, for msgspec to copy: no deeper than this, no numbers at the edge of what there are."""
+
+    value: dict[str, _LEAF | list[_INNER] | dict[str, _INNER]]
 
 
 class _NotPlain(ValueError):
@@ -29,6 +41,13 @@ def plain(value: Any, where: str) -> Any:
     Raises:
         ValueError: Anything else; the message says where.
     """
+    if type(value) is dict:
+        try:
+            copy = msgspec.convert({"value": value}, _Usual).value
+            if copy == value:  # msgspec also makes lists of sets
+                return copy
+        except Exception:  # something else, which the search below names, or takes
+            pass
     try:
         return _copied(value, 0)
     except _NotPlain as error:

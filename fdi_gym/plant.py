@@ -1,118 +1,29 @@
 """What a plant declares: its data sheet (signals, fault modes, labels), its equations, and its fault processes.
 
 A plant file in `fdi_gym/plants/` has the lines `ID = "..."` and `VERSION = ...` and a function `plant(**options)` that
-returns a `Plant`; `fdi_gym/discovery.py` finds it.
+returns a `Plant`; `fdi_gym/discovery.py` finds it. All that such a file needs to declare it is imported from here.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import importlib
-import itertools
-import reprlib
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from fdi_gym.checks import check_declaration, check_scenario, twice, unknown
+from fdi_gym.data_sheet import FaultMode, Kernels, Label, Signal, squared_error
 from fdi_gym.faults import FaultProcess, FaultScenario
-from fdi_gym.model import Array, Model, contiguous
+from fdi_gym.model import Array
 from fdi_gym.shapes import OPEN, Shapes
-from fdi_gym.theta import ThetaTable, theta_table
+from fdi_gym.truth import Truth
 
 
 class NotApplicableError(ValueError):
     """A method's word that it cannot run on a plant, with the reason (no unknown input, rank condition)."""
-
-
-class Signal(NamedTuple):
-    """One entry of a vector: its name, unit and range.
-
-    Args:
-        name: What it is, in the field's words.
-        unit: SI or the source's unit; "" where it has none.
-        low: Lower end of its range; a sensor saturates there.
-        high: Upper end.
-        scale: Typical size, by which learners divide.
-        sigma: Standard deviation of its white noise: per sample of a sensor, per step of a state. 0 for others.
-        nominal: Trim value of a command or state, healthy value of a fault parameter.
-        period: Of an angle that is known up to whole turns: a turn in its unit. 0 for others.
-    """
-
-    name: str
-    unit: str
-    low: float
-    high: float
-    scale: float = 1.0
-    sigma: float = 0.0
-    nominal: float = 0.0
-    period: float = 0.0
-
-
-class FaultMode(NamedTuple):
-    """A discrete class of fault, of which the labels are made.
-
-    Args:
-        name: For example "aileron LOE".
-        description: What it does to theta.
-        size: Maps theta (..., n_theta) to the fault's size (...), for accuracy by severity.
-        bands: Sizes below the first are "small", below the second "medium", else "large".
-        offset, direction, reach: The line that the fault spans in the estimated space, as a deviation from healthy:
-            offset + m direction with m in reach. A stuck surface has offset -1 in its effectiveness, direction its
-            position. Two faults add their deviations. A fault that is building up is on its way from healthy to there;
-            processes other than "standard" may draw one that stays short of the reach, none beyond it.
-    """
-
-    name: str
-    description: str
-    size: Callable[[Array], Array]
-    bands: tuple[float, float]
-    offset: tuple[float, ...]
-    direction: tuple[float, ...]
-    reach: tuple[float, float]
-
-
-class Label(NamedTuple):
-    """One answer of the isolation task: the set of fault modes that are active."""
-
-    name: str
-    modes: frozenset[str]
-
-
-class Kernels(NamedTuple):
-    """A plant's compiled equations; the roles and signatures are those of `fdi_gym.kernels`."""
-
-    dynamics: Any
-    output: Any
-    control: Any
-    known: Any = None
-    project: Any = None
-    outside: Any = None
-
-
-class Inputs(NamedTuple):
-    """What a scenario's dicts make: rows (steps + 1, n_r) and (steps + 1, n_d), parameters (n_p,).
-
-    Rows that are the same at every sample are one row, (1, n).
-    """
-
-    reference: Array
-    disturbance: Array
-    physical: Array
-
-
-def squared_error(scale: Sequence[float]) -> Callable[[Array], Array]:
-    """The usual identification reward: minus the sum of squared errors (..., n), each divided by its scale."""
-    weight = 1.0 / np.asarray(scale, float) ** 2
-
-    def reward(error: Array) -> Array:
-        return -(error**2 * weight).sum(axis=-1)  # not a matrix product: the same bits for one as for many
-
-    return reward
 
 
 def _no_rows(scenario: FaultScenario) -> Array:
@@ -127,25 +38,6 @@ def _no_change(physical: Mapping[str, Any]) -> Array:
     if physical:
         raise ValueError(f"this plant has no physical parameters to change, but the scenario sets {', '.join(physical)}")
     return np.zeros(0)
-
-
-class _Sent:
-    """A kernel under way to another process: by its name where it has one, else by its source; compiled there."""
-
-    def __init__(self, dispatcher: Any):
-        self.dispatcher = dispatcher
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        from fdi_gym import kernels
-
-        function = self.dispatcher.py_func
-        if getattr(sys.modules.get(function.__module__), function.__name__, None) is self.dispatcher:
-            return _arrived, (function.__module__, function.__name__)
-        return kernels.kernel, (function,)
-
-
-def _arrived(module: str, name: str) -> Any:
-    return getattr(importlib.import_module(module), name)
 
 
 class _ByName:
@@ -168,7 +60,7 @@ class _ByName:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Plant(Model):
+class Plant(Truth):
     """A plant's whole declaration. Built by the plant file's `plant(**options)`; plain data, functions and kernels.
 
     A contradiction in it raises ValueError. A plant that `load_plant` built is pickled as its id and options, equals
@@ -265,8 +157,10 @@ class Plant(Model):
     def __reduce__(self) -> tuple[Any, ...]:
         if self.origin is not None:
             return self.origin.build, ()
+        from fdi_gym.kernels import Sent
+
         state = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        state["kernels"] = Kernels(*(f if f is None else _Sent(f) for f in self.kernels))
+        state["kernels"] = Kernels(*(f if f is None else Sent(f) for f in self.kernels))
         return object.__new__, (Plant,), state
 
     def __eq__(self, other: object) -> bool:
@@ -313,44 +207,9 @@ class Plant(Model):
         return tuple(s.name for s in self.commands)
 
     @functools.cached_property
-    def _label_index(self) -> dict[frozenset[str], int]:
-        return {frozenset(label.modes): index for index, label in enumerate(self.labels)}
-
-    def label_of(self, modes: frozenset[str]) -> int:
-        """Index of the label whose modes these are.
-
-        Raises:
-            ValueError: No label says so; the message lists those that exist.
-        """
-        index = self._label_index.get(modes)
-        if index is None:
-            names = ", ".join(label.name for label in self.labels)
-            raise ValueError(f"{self.id} has no label for {sorted(modes)} at once; it has {names}")
-        return index
-
-    def label_intervals(self, scenario: FaultScenario) -> Iterator[tuple[int, int, frozenset[str]]]:
-        """The flight's intervals (first step, end step, active modes) between the changes of the set of active modes."""
-        ends = [scenario.steps if f.end is None else min(f.end, scenario.steps) for f in scenario.faults]
-        edges = sorted({0, scenario.steps, *(min(f.onset, scenario.steps) for f in scenario.faults), *ends})
-        for start, stop in itertools.pairwise(edges):
-            active = (f.mode for f, end in zip(scenario.faults, ends, strict=True) if f.onset <= start < end)
-            yield start, stop, frozenset(active)
-
-    def label_rows(self, scenario: FaultScenario) -> Array:
-        """The true label at the samples 0..K: sample k has that of the fault which acted over [k - 1, k)."""
-        rows = np.zeros(scenario.steps + 1, dtype=np.int64)
-        for first, label in self.label_changes(scenario):
-            rows[first:] = label
-        return rows
-
-    def label_changes(self, scenario: FaultScenario) -> list[tuple[int, int]]:
-        """The true label as (first sample, label), in order: sample k has that of the fault which acted over [k - 1, k)."""
-        changes = [(0, 0)]
-        for start, _, active in self.label_intervals(scenario):
-            label = self.label_of(active)
-            if label != changes[-1][1]:
-                changes.append((start + 1, label))
-        return changes
+    def mode_names(self) -> tuple[str, ...]:
+        """Names of the fault modes, in order."""
+        return tuple(mode.name for mode in self.modes)
 
     def validate(self, scenario: FaultScenario) -> None:
         """Whether a scenario fits this plant, whole: every flight asks before a kernel sees it.
@@ -360,41 +219,6 @@ class Plant(Model):
             TypeError: It is no scenario.
         """
         check_scenario(self, scenario)
-
-    def inputs(self, scenario: FaultScenario) -> Inputs:
-        """What the scenario's dicts make for the kernels, in the shapes that they take.
-
-        Raises:
-            ValueError: The plant's function refuses the dict, or returns something else than finite rows of that shape.
-        """
-        rows = scenario.steps + 1
-        if self.disturbance is None:
-            d = np.zeros((1, len(self.disturbances)))
-        else:
-            d = self._made("disturbance", self.disturbance, scenario, (rows, len(self.disturbances)))
-        p = self.nominal_p
-        if scenario.physical:
-            p = self._made("physical", lambda s: self.physical(s.physical), scenario, p.shape)
-        return Inputs(self._made("reference", self.reference, scenario, (rows, None)), d, p)
-
-    def _made(self, name: str, make: Callable[[FaultScenario], Array], scenario: FaultScenario, shape: tuple) -> Array:
-        try:
-            made = np.asarray(make(scenario), float)
-        except Exception as error:  # whatever the plant's author did not think of
-            what = f"{type(error).__name__}: {error}"
-            raise ValueError(f"{name} of a {self.id} scenario, {reprlib.repr(getattr(scenario, name))}: {what}") from error
-        fits = made.ndim == len(shape) and all(n in (m, None) for m, n in zip(made.shape, shape, strict=True))
-        given = contiguous(made[:1] if fits and made.ndim == 2 and made.strides[0] == 0 else made)  # one row, broadcast
-        if not fits or not np.isfinite(given).all():
-            raise ValueError(
-                f"{name} of a {self.id} scenario: the plant makes finite numbers in the shape {shape} of it, not those of "
-                f"{reprlib.repr(getattr(scenario, name))} ({made.shape}{', not all finite' if fits else ''})"
-            )
-        return given
-
-    def theta_table(self, scenario: FaultScenario) -> ThetaTable:
-        """What the scenario makes of theta (see `fdi_gym.theta.theta_table`)."""
-        return theta_table(scenario, self.nominal_theta, self.theta_entries, self.command_names, self.dt)
 
     def process(self, name: str) -> FaultProcess:
         """A fault process by name.

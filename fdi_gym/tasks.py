@@ -127,7 +127,7 @@ class Isolation(Task):
             return action  # type: ignore[return-value]
         value, labels = _array(action), len(self.plant.labels)
         good = value.shape == shape and value.dtype.kind in "iu" and not holds_bool(action)
-        if not good or (value < 0).any() or (value >= labels).any():
+        if not good or (value.size and not 0 <= value.min() <= value.max() < labels):
             raise ValueError(f"the action is a label in 0..{labels - 1}, shape {shape} and integer, not {action!r}")
         return value
 

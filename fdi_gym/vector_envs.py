@@ -74,6 +74,7 @@ class FDIVectorEnv(Specified, VectorEnv):
         self._flights: Flights | None = None
         self._k = np.zeros(num_envs, dtype=np.int64)
         self._over = np.ones(num_envs, dtype=bool)
+        self._waits, self._fresh = True, True  # whether any episode is over, and whether any has just begun
         self._all = np.arange(num_envs)
         self._declared: list[list[tuple[int, Array]]] = [[] for _ in range(num_envs)]
         self._records: dict[int, Record] = {}
@@ -143,6 +144,7 @@ class FDIVectorEnv(Specified, VectorEnv):
             self._now, self._ahead = self._rules.period - 1, ahead(0, self._rules.period)
             self._filled = self._now + 1 + self._ahead
         self._k[slots], self._over[slots], self._row[slots] = 0, False, self._now
+        self._waits, self._fresh = bool(self._over.any()), True
         self._fly(self._now, slots)
 
     def _fly(self, first: int, slots: Array) -> None:
@@ -177,29 +179,34 @@ class FDIVectorEnv(Specified, VectorEnv):
             raise RuntimeError("no episode has begun: call reset()")
         task = self._rules.task
         checked = task.check(actions, (self.num_envs,))
-        over = self._over
-        begin = np.flatnonzero(over)
-        if begin.size and self._mode is AutoresetMode.DISABLED:
+        over, waits = self._over, self._waits
+        begin = np.flatnonzero(over) if waits else self._all[:0]
+        if waits and self._mode is AutoresetMode.DISABLED:
             raise RuntimeError(f"episodes {begin.tolist()} are over: reset them with options={{'reset_mask': ...}}")
         k = self._k
         reward = np.asarray(task.reward(checked, self._here(self._buffer.label), self._here(self._target)), float)
-        reward = np.where((k == 0) | over, 0.0, reward)
+        if waits or self._fresh:
+            reward = np.where((k == 0) | over, 0.0, reward)
         if self.render_mode is not None:
             for i in np.flatnonzero(~over):
                 self._declared[i].append((int(k[i]), checked[i]))
         if self._now + 1 == self._filled:
             self._fly_all()
         period = self._rules.period
-        self._k = np.where(over, k, np.minimum(k + period, flights.length))
+        self._k = np.minimum(k + period, flights.length)
+        if waits:
+            self._k[over] = k[over]
         self._row = self._now + self._k - k
         self._now += period
-        ended = (self._k == flights.length) & ~over
-        if task.at_end and ended.any():
+        ended = self._k == flights.length
+        if waits:
+            ended &= ~over
+        self._over, self._waits, self._fresh = ended, bool(ended.any()), False
+        if task.at_end and self._waits:
             flown = [s for s, last in zip(self.scenarios, ended, strict=True) if last and s is not None]
             reward[ended] = self._rules.final(checked[ended], flown)
         terminated = ended & flights.terminated
-        truncated = ended & ~terminated
-        self._over = ended
+        truncated = ended ^ terminated
         infos: dict[str, Any] = {}
         if self._mode is AutoresetMode.SAME_STEP:
             begin = np.flatnonzero(ended)

@@ -11,7 +11,7 @@ from conftest import ROOT, build
 
 from fdi_gym import integration, kernels
 from fdi_gym.discovery import load_plant
-from fdi_gym.drawing import streams
+from fdi_gym.drawing import random_sign, stream, streams, uniform
 from fdi_gym.engine import no_noise, simulate, white_noise
 from fdi_gym.faults import (
     Abrupt,
@@ -108,6 +108,25 @@ def test_hold_with_lag_takes_the_command_before():
 def test_streams_are_independent():
     assert len({np.random.default_rng(s).random() for s in streams(7)}) == 4
     assert streams(7).noise.generate_state(1) == streams(7).noise.generate_state(1)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 7, 2**32 - 1, 2**32, 2**63 - 1, 2**64 - 1, 2**64, 2**100 + 3])
+def test_a_stream_is_what_numpy_spawns_in_its_place(seed):
+    for name, spawned in zip(streams(seed)._fields, np.random.SeedSequence(seed).spawn(4), strict=True):
+        assert stream(seed, name).generate_state(8).tolist() == spawned.generate_state(8).tolist()
+
+
+@pytest.mark.parametrize(("ours", "numpys"), [
+    (lambda rng: uniform(rng, -0.3, 7.1), lambda rng: float(rng.uniform(-0.3, 7.1))),
+    (random_sign, lambda rng: rng.choice([-1.0, 1.0])),
+], ids=["uniform", "random_sign"])  # fmt: skip
+def test_numbers_are_drawn_as_numpy_draws_them(ours, numpys):
+    ours_from, numpys_from = np.random.default_rng(3), np.random.default_rng(3)
+    drawn = [ours(ours_from) for _ in range(1000)]
+    assert drawn == [numpys(numpys_from) for _ in range(1000)]
+    assert type(drawn[0]) is float
+    assert len(set(drawn)) > 1
+    assert ours_from.bit_generator.state == numpys_from.bit_generator.state
 
 
 def test_noise_has_the_declared_statistics(b747):

@@ -1,6 +1,7 @@
 """The engine: the same bytes however a flight is cut up, what is put into it does what it says, noise is white."""
 
 import copy
+import dataclasses
 import os
 import pickle
 import subprocess
@@ -123,6 +124,32 @@ def test_simulate_is_advance_to_the_end(plant):
 
 # ---------------------------------------------------------------------------------------------------------------
 # What acts
+
+
+def test_a_row_kept_once_flies_as_rows_that_repeat_it(plant):
+    drawn = scenarios(plant, 1)[0]
+    kept = {"reference": plant.inputs(drawn).reference[-1]}
+    if plant.disturbance is not None:
+        kept["disturbance"] = plant.inputs(drawn).disturbance[-1]
+    once = {name: lambda s, row=row: np.broadcast_to(row, (s.steps + 1, row.size)) for name, row in kept.items()}
+    often = {name: lambda s, row=row: np.tile(row, (s.steps + 1, 1)) for name, row in kept.items()}
+    once, often = dataclasses.replace(plant, **once), dataclasses.replace(plant, **often)
+    for name in kept:
+        assert len(getattr(once.inputs(drawn), name)) == 1
+        assert len(getattr(often.inputs(drawn), name)) == drawn.steps + 1
+    for a, b in zip(simulate(once, [drawn]), simulate(often, [drawn]), strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
+def test_a_reference_of_another_width_is_refused_and_the_flights_go_on(motor):
+    plant = dataclasses.replace(motor, reference=lambda s: np.ones((s.steps + 1, 1 if s.noise_seed else 2)))
+    good = scenarios(motor, 2)
+    flights, expected = (Flights(plant, good) for _ in range(2))
+    with pytest.raises(ValueError, match=r"^reference of a DCMotor scenario: .* in the shape \(\d+, 1\)"):
+        flights.begin([1], [good[1].replace(noise_seed=0)])
+    with pytest.raises(ValueError, match=r"^reference of a DCMotor scenario"):
+        simulate(plant, [good[0].replace(noise_seed=0), good[1]])
+    equal(advance(flights, 151), advance(expected, 151), flights)
 
 
 def test_theta_is_what_the_scenarios_table_says(plant):

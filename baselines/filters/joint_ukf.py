@@ -22,7 +22,8 @@ from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.estimation.decision import Reading
 from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import Corrected, correct, quadratic
-from fdi_gym.plant import Array, Plant, contiguous
+from fdi_gym.model import contiguous
+from fdi_gym.plant import Array, Plant
 from fdi_gym.plants.cmg_satellite import SIGMA_Q
 
 N_XI, N_X, N_SEEN = 10, 14, 6  # (q_v, w, d); with f; the channels that carry fault information: q_v and w

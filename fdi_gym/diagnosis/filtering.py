@@ -20,7 +20,8 @@ from fdi_gym.diagnosis.contract import Diagnoser, Diagnosis, among
 from fdi_gym.estimation.decision import Reading, Rule, Verdict
 from fdi_gym.estimation.equivalent import has_equivalents, nearest
 from fdi_gym.estimation.interval import Interval, held_command_covariance
-from fdi_gym.plant import Array, Plant, contiguous
+from fdi_gym.model import contiguous
+from fdi_gym.plant import Array, Plant
 
 NO_P, NO_STD = np.zeros((0, 0, 0)), np.zeros((0, 0))
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from fdi_gym.diagnosis import compiled
 from fdi_gym.diagnosis.contract import Diagnoser, Diagnosis, choose, map_arrays
-from fdi_gym.plant import Array, Plant, contiguous
+from fdi_gym.model import contiguous
+from fdi_gym.plant import Array, Plant
 
 LARGE = 1e12  # an estimate beyond it, in units of its scale, has left the numbers
 SUM = 1e-6  # by which probabilities may miss 1

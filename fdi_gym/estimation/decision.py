@@ -28,7 +28,8 @@ from fdi_gym.estimation.belief import FaultInputs, noisy_sensors
 from fdi_gym.estimation.calibration import LEAST, Calibration, Persistence
 from fdi_gym.estimation.kalman import quadratic
 from fdi_gym.estimation.labels import channel_sets, distances, label_of_channels, manifolds
-from fdi_gym.plant import Array, Plant, contiguous
+from fdi_gym.model import contiguous
+from fdi_gym.plant import Array, Plant
 
 
 class Reading(NamedTuple):

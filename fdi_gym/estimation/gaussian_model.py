@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi_gym.plant import Array, Plant, contiguous
+from fdi_gym.model import contiguous
+from fdi_gym.plant import Array, Plant
 
 STEP = 1e-3  # of the central differences along the axes, in units of the entries' scales
 

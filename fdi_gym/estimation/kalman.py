@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi_gym.estimation import compiled, gaussian
-from fdi_gym.plant import Array, contiguous
+from fdi_gym.model import contiguous
+from fdi_gym.plant import Array
 
 
 def T(M: Array) -> Array:

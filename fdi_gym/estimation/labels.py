@@ -12,7 +12,8 @@ import numpy as np
 
 from fdi_gym.estimation import label_kernels
 from fdi_gym.estimation.belief import FaultInputs
-from fdi_gym.plant import Array, Plant, contiguous
+from fdi_gym.model import contiguous
+from fdi_gym.plant import Array, Plant
 
 
 class Manifolds(NamedTuple):
