@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import void
 
-from baselines.filters.two_stage_kernels import M3, symmetric
+from baselines.filters.two_stage_kernels import M3, product, symmetric, times
 from baselines.filters.two_stage_kf import TwoStage, decision_rule, initial_covariances, read, start
 from baselines.filters.two_stage_kf import correct as two_stage_correct
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
@@ -24,7 +24,8 @@ def _predict(x, Px, V, u, A, B, E_0, E_u, Q, x1, Px1, V1):
         E = E_0.copy()
         for j in range(len(E_u)):
             E += u[k, j] * E_u[j]
-        x1[k], Px1[k], V1[k] = A @ x[k] + B @ u[k], symmetric(A @ Px[k] @ A.T + Q[k % len(Q)]), A @ V[k] + E
+        x1[k], V1[k] = times(A, x[k]) + times(B, u[k]), product(A, V[k]) + E
+        Px1[k] = symmetric(product(product(A, Px[k]), A.T) + Q[k % len(Q)])
 
 
 def predict(s: TwoStage, u: Array, model: LinearModel, Q: Array, Qz: Array) -> TwoStage:

@@ -22,6 +22,33 @@ def solved(S, N):
 
 
 @helper
+def product(A, B):
+    """A B: for matrices of this size a call of BLAS costs several times what the loops do."""
+    (n, m), r = A.shape, B.shape[1]
+    C = np.empty((n, r))
+    for i in range(n):
+        for j in range(r):
+            total = 0.0
+            for k in range(m):
+                total += A[i, k] * B[k, j]
+            C[i, j] = total
+    return C
+
+
+@helper
+def times(A, v):
+    """A v."""
+    n, m = A.shape
+    w = np.empty(n)
+    for i in range(n):
+        total = 0.0
+        for k in range(m):
+            total += A[i, k] * v[k]
+        w[i] = total
+    return w
+
+
+@helper
 def symmetric(P):
     """(P + P') / 2: what rounding took away."""
     return 0.5 * (P + P.T)
@@ -46,7 +73,7 @@ def forget(Pz, rule, factor, a_min, a_max, q, aged):
                     a[i] = max(a[i], min(a[i] / factor, a_max))
                 elif a[i] <= a_max:
                     a[i] = a_min + a[i] * (a_max - a_min) / a_max
-            aged[e] = (v * a) @ v.T
+            aged[e] = product(v * a, v.T)
         aged[e] += q * eye
 
 
@@ -57,15 +84,15 @@ def predict(x, Px, z, Pz, V, Pz_minus, steady, u, A, B, E_0, E_u, Q, x1, Px1, V1
         E = E_0.copy()
         for j in range(len(E_u)):
             E += u[k, j] * E_u[j]
-        W = A @ V[k] + E
-        WPz = W @ Pz[k]
+        W = product(A, V[k]) + E
+        WPz = product(W, Pz[k])
         if steady:
             V1[k] = W
         else:
             V1[k] = solved(Pz_minus[k], WPz.T).T
-        x1[k] = A @ x[k] + B @ u[k] + (W - V1[k]) @ z[k]
+        x1[k] = times(A, x[k]) + times(B, u[k]) + times(W - V1[k], z[k])
         # W Pz W' - V Pz- V', with V Pz- = W Pz
-        Px1[k] = symmetric(A @ Px[k] @ A.T + Q[k % len(Q)] + WPz @ (W - V1[k]).T)
+        Px1[k] = symmetric(product(product(A, Px[k]), A.T) + Q[k % len(Q)] + product(WPz, (W - V1[k]).T))
 
 
 @compiled(void(M, M3, M, M3, M3, M, B2, M, M, M, M3, M, M3, M3, M, M3, I1))
@@ -75,8 +102,8 @@ def correct(x, Px, z, Pz, V, y, seen, C, R, x1, Px1, z1, Pz1, V1, nu, S_z, count
     A sensor that did not report has residual 0, variance 1 and no covariance with anything: its row is gone.
     """
     for k in range(len(x)):
-        r, H, CPx = y[k] - C @ x[k], C @ V[k], C @ Px[k]
-        S = CPx @ C.T + R
+        r, H, CPx = y[k] - times(C, x[k]), product(C, V[k]), product(C, Px[k])
+        S = product(CPx, C.T) + R
         count[k] = 0
         for i in range(len(r)):
             if seen[k, i]:
@@ -84,18 +111,18 @@ def correct(x, Px, z, Pz, V, y, seen, C, R, x1, Px1, z1, Pz1, V1, nu, S_z, count
             else:
                 r[i], H[i], CPx[i] = 0.0, 0.0, 0.0
                 S[i], S[:, i], S[i, i] = 0.0, 0.0, 1.0
-        HPz = H @ Pz[k]
-        S_z[k] = HPz @ H.T + S
+        HPz = product(H, Pz[k])
+        S_z[k] = product(HPz, H.T) + S
         Kx, Kz = solved(S, CPx).T, solved(S_z[k], HPz).T
-        nu[k] = r - H @ z[k]
-        x1[k], Px1[k] = x[k] + Kx @ r, symmetric(Px[k] - Kx @ CPx)
-        z1[k], Pz1[k] = z[k] + Kz @ nu[k], symmetric(Pz[k] - Kz @ HPz)
-        V1[k] = V[k] - Kx @ H
+        nu[k] = r - times(H, z[k])
+        x1[k], Px1[k] = x[k] + times(Kx, r), symmetric(Px[k] - product(Kx, CPx))
+        z1[k], Pz1[k] = z[k] + times(Kz, nu[k]), symmetric(Pz[k] - product(Kz, HPz))
+        V1[k] = V[k] - product(Kx, H)
 
 
 @compiled(void(M, M3, M, M3, M3, M, M3))
 def optimal(x, Px, z, Pz, V, X, P):
     """The optimal state estimate x + V z and its covariance Px + V Pz V', eqs. 40 and 41."""
     for k in range(len(x)):
-        X[k] = x[k] + V[k] @ z[k]
-        P[k] = Px[k] + V[k] @ Pz[k] @ V[k].T
+        X[k] = x[k] + times(V[k], z[k])
+        P[k] = Px[k] + product(product(V[k], Pz[k]), V[k].T)
