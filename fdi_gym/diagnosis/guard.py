@@ -54,12 +54,14 @@ def examiner(plant: Plant) -> Callable[[int, Any], Examined]:
 
 
 _NUMBERS = Diagnosis._fields[2:6]
-_TYPES = {"b": (np.bool_, "bool"), "iu": (np.int64, "integer"), "iuf": (np.float64, "numbers, or None")}
+_TYPES = {"b": (np.dtype(bool), "bool"), "iu": (np.dtype(np.int64), "integer"), "iuf": (np.dtype(float), "numbers, or None")}
 
 
 def _copied(name: str, given: Any, shape: tuple[int, ...], kinds: str) -> Array:
     """A field in its declared type; a copy, so that nobody who is told it reaches into the method's state."""
     dtype, what = _TYPES[kinds]
+    if type(given) is np.ndarray and given.dtype == dtype and given.shape == shape:
+        return given.copy()
     value = np.array(given, order="C")
     if value.shape != shape or value.dtype.kind not in kinds:
         raise ValueError(f"a diagnosis has {name} of shape {shape} and {what}, not {value.shape} of {value.dtype}")
@@ -116,10 +118,8 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
             )
         if n == 0:
             return state, last
-        shown = ~lost
-        if not raw.gaps:
-            shown &= np.isfinite(obs).all(axis=1)
-        whole = bool(shown.all())
+        shown = ~lost if raw.gaps else ~lost & np.isfinite(obs).all(axis=1)
+        whole = np.count_nonzero(shown) == n
         if not whole:
             obs = np.where(shown[:, None], obs, last_obs)
         with np.errstate(all="ignore"):

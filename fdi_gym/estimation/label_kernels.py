@@ -14,11 +14,18 @@ SETS = (I1, M, M3, M, M)  # faults, offset, direction, low, high: of the sets, a
 
 
 @helper
-def nearest_points(I, Iz, faults, offset, direction, low, high, value, m):  # noqa: E741 (the information)
-    """value[s] = min of q' I q - 2 q' Iz over q = offset[s] + direction[s] m[s] with m[s] in its box, for all sets s."""
-    sets, p, most = direction.shape
+def room(p, most):
+    """What `nearest_points` works in, for sets of up to `most` faults in p dimensions."""
     G, g, ID, Io = np.empty((most, most)), np.empty(most), np.empty((most, p)), np.empty(p)
     a, at, where, tried = np.empty((most, most + 1)), np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
+    return G, g, ID, Io, a, at, where, tried
+
+
+@helper
+def nearest_points(I, Iz, faults, offset, direction, low, high, value, m, room):  # noqa: E741 (the information)
+    """value[s] = min of q' I q - 2 q' Iz over q = offset[s] + direction[s] m[s] with m[s] in its box, for all sets s."""
+    sets, p, most = direction.shape
+    G, g, ID, Io, a, at, where, tried = room
     for s in range(sets):
         f = faults[s]
         base = 0.0
@@ -47,32 +54,45 @@ def nearest_points(I, Iz, faults, offset, direction, low, high, value, m):  # no
 @compiled(void(M3, M, *SETS, M, M3))
 def nearest(I, Iz, faults, offset, direction, low, high, value, m):  # noqa: E741
     """value (n, sets) and m (n, sets, f) of `nearest_points` for I (n or 1, p, p) and Iz (n, p)."""
+    work = room(direction.shape[1], direction.shape[2])
     for e in range(len(Iz)):
-        nearest_points(I[e % len(I)], Iz[e], faults, offset, direction, low, high, value[e], m[e])
+        nearest_points(I[e % len(I)], Iz[e], faults, offset, direction, low, high, value[e], m[e], work)
+
+
+@helper
+def invert(P, excess, a, I):  # noqa: E741
+    """I = (P + excess)^-1; a is room to work in."""
+    for i in range(len(P)):
+        for j in range(len(P)):
+            a[i, j] = P[i, j] + excess[i, j]
+            I[i, j] = 1.0 if i == j else 0.0
+    eliminate(a, I)
+
+
+@helper
+def informative(I, z, Iz):  # noqa: E741
+    """Iz = I z, and z' I z."""
+    healthy = 0.0
+    for i in range(len(z)):
+        Iz[i] = 0.0
+        for j in range(len(z)):
+            Iz[i] += I[i, j] * z[j]
+        healthy += z[i] * Iz[i]
+    return healthy
 
 
 @compiled(void(M, M3, M, *SETS, M, M3))
 def distances(z, P, excess, faults, offset, direction, low, high, J, m):
     """J (n, 1 + sets): squared distances of z (n, p) to healthy and each set in the metric of P (n or 1, p, p) + excess."""
     n, p = z.shape
-    a, I, Iz = np.empty((p, p)), np.empty((p, p)), np.empty(p)  # noqa: E741
+    a, I, Iz, work = np.empty((p, p)), np.empty((p, p)), np.empty(p), room(p, direction.shape[2])  # noqa: E741
     for e in range(n):
         if e < len(P):
-            for i in range(p):
-                for j in range(p):
-                    a[i, j] = P[e, i, j] + excess[i, j]
-                    I[i, j] = 1.0 if i == j else 0.0
-            eliminate(a, I)
-        healthy = 0.0
-        for i in range(p):
-            Iz[i] = 0.0
-            for j in range(p):
-                Iz[i] += I[i, j] * z[e, j]
-            healthy += z[e, i] * Iz[i]
-        J[e, 0] = healthy
-        nearest_points(I, Iz, faults, offset, direction, low, high, J[e, 1:], m[e])
+            invert(P[e], excess, a, I)
+        J[e, 0] = informative(I, z[e], Iz)
+        nearest_points(I, Iz, faults, offset, direction, low, high, J[e, 1:], m[e], work)
         for s in range(len(faults)):
-            J[e, 1 + s] += healthy
+            J[e, 1 + s] += J[e, 0]
 
 
 @helper
