@@ -27,7 +27,7 @@ from fdi_gym.estimation.automaton import Automaton, first, step
 from fdi_gym.estimation.belief import FaultInputs, noisy_sensors
 from fdi_gym.estimation.calibration import LEAST, Calibration, Persistence
 from fdi_gym.estimation.kalman import quadratic
-from fdi_gym.estimation.labels import channel_sets, distances, label_of_channels, manifolds
+from fdi_gym.estimation.labels import channel_sets, label_of_channels, manifolds
 from fdi_gym.plant import Array, Plant, contiguous
 
 
@@ -197,34 +197,32 @@ def by_labels(
     m, p = len(plant.outputs), len(plant.estimated)
     excess = np.zeros((p, p)) if calibration.excess is None or fixed is not None else contiguous(calibration.excess)
     limit = np.inf if calibration.rise is None else calibration.rise
-    where = np.concatenate([[0], sets.labels])
-    in_order, back = bool((where == np.arange(len(where))).all()), np.argsort(where)
-    lengths = after.rise, after.switch, after.release, after.same
-    none = np.zeros(0)
+    lengths = np.array([after.rise, after.switch, after.release, after.same, after.warmup], np.int64)
+    none, labels, (h, _, f) = np.zeros(0), len(plant.labels), sets.direction.shape
 
     def start(n: int) -> Any:
         return undeclared(n), None
 
     def step(state: Any, k: Array, r: Reading, informed: Array) -> tuple[Any, Verdict]:
         declared, tested = state
-        cost, found, rise = r.cost, None, None
-        if cost is None:
+        n, rise = len(k), None
+        if statistic is not None:
+            tested = statistic.start(n, r.nu.shape[1] if r.nu is not None else m) if tested is None else tested
+            tested, rise = statistic.step(tested, r, informed & (k > after.warmup))
+        following, alarm = Automaton(*[np.empty(n, np.int64) for _ in declared]), np.empty(n, bool)
+        told = (penalty, none if rise is None else rise, limit, lengths, k, informed, *declared)
+        z = None
+        if r.cost is not None:
+            cost = contiguous(r.cost)
+            label_kernels.declare(cost, *told, *following, alarm)
+        else:
             assert r.z is not None
             assert r.P is not None
-            found = distances(r.z, r.P if fixed is None else fixed, sets, excess)
-            cost = found.J if in_order else found.J[:, back]
-        if statistic is not None:
-            tested = statistic.start(len(cost), r.nu.shape[1] if r.nu is not None else m) if tested is None else tested
-            tested, rise = statistic.step(tested, r, informed & (k > after.warmup))
-        n = len(cost)
-        following, alarm = Automaton(*np.empty((5, n), np.int64)), np.empty(n, bool)
-        label_kernels.declare(
-            contiguous(cost), penalty, none if rise is None else rise, limit, k, after.warmup, informed, *declared, *lengths,
-            *following, alarm,
-        )  # fmt: skip
-        z = None
-        if on_line and found is not None:
-            z = (sets.points(found.m) * (sets.labels == following.label[:, None])[..., None]).sum(axis=1)
+            P = contiguous(r.P) if fixed is None else fixed
+            cost, at = np.empty((n, labels)), np.empty((n, h, f))
+            label_kernels.judge(contiguous(r.z), P, excess, *sets, *told, cost, at, *following, alarm)
+            if on_line:
+                z = (sets.points(at) * (sets.labels == following.label[:, None])[..., None]).sum(axis=1)
         return (following, tested), Verdict(alarm, following.label, z, Evidence(cost, rise))
 
     return Rule(start, step)

@@ -120,24 +120,60 @@ def gain(cost, penalty):
     return share
 
 
-@compiled(void(M, V, V, float64, I1, int64, B1, I1, I1, I1, I1, I1, int64, int64, int64, boolean, I1, I1, I1, I1, I1, B1))
+@helper
+def declared(cost, penalty, statistic, limit, after, label, over, other, under, last):
+    """One automaton one sample later, from the costs (labels,) and what each label must gain.
+
+    The statistic (1,), where there is one (else (0,)), takes the place of the costs in raising an alarm.
+    """
+    rise, switch, release, same = after[0], after[1], after[2], after[3] > 0
+    if same:  # health is a label like the others
+        best = lowest(cost, penalty, 0)
+        above, below = best > 0, False
+    else:
+        best, share = lowest(cost, penalty, 1), gain(cost, penalty)
+        above, below = statistic[0] > limit if statistic.size else share > 1.0, share < 0.5
+    return advance(label, over, other, under, last, best, above, below, rise, switch, release, same)
+
+
+@compiled(void(M, V, V, float64, I1, I1, B1, I1, I1, I1, I1, I1, I1, I1, I1, I1, I1, B1))
 def declare(
-    cost, penalty, statistic, limit, k, warmup, informed, label, over, other, under, last, rise, switch, release, same,
+    cost, penalty, statistic, limit, after, k, informed, label, over, other, under, last,
     label1, over1, other1, under1, last1, alarm,
 ):  # fmt: skip
     """The automata one sample later, and whether they alarm, from the costs (n, labels) and what each label must gain.
 
-    The statistic (n,), where there is one, takes the place of the costs in raising an alarm.
+    The statistic (n,), where there is one, takes the place of the costs in raising an alarm. after: rise, switch, release,
+    same and warmup of a persistence.
     """
     for e in range(len(cost)):
         state = label[e], over[e], other[e], under[e], last[e]
-        if informed[e] and k[e] > warmup:
-            if same:  # health is a label like the others
-                best = lowest(cost[e], penalty, 0)
-                above, below = best > 0, False
-            else:
-                best, share = lowest(cost[e], penalty, 1), gain(cost[e], penalty)
-                above, below = statistic[e] > limit if statistic.size else share > 1.0, share < 0.5
-            state = advance(*state, best, above, below, rise, switch, release, same)
+        if informed[e] and k[e] > after[4]:
+            state = declared(cost[e], penalty, statistic[e : e + 1], limit, after, *state)
+        label1[e], over1[e], other1[e], under1[e], last1[e] = state
+        alarm[e] = state[0] > 0
+
+
+@compiled(void(M, M3, M, I1, *SETS, V, V, float64, I1, I1, B1, I1, I1, I1, I1, I1, M, M3, I1, I1, I1, I1, I1, B1))
+def judge(
+    z, P, excess, labels, faults, offset, direction, low, high,
+    penalty, statistic, limit, after, k, informed, label, over, other, under, last,
+    cost, m, label1, over1, other1, under1, last1, alarm,
+):  # fmt: skip
+    """`distances` as the costs of `declare`: of health, and of set s at labels[s]."""
+    n, p = z.shape
+    a, I, Iz, work = np.empty((p, p)), np.empty((p, p)), np.empty(p), room(p, direction.shape[2])  # noqa: E741
+    J = np.empty(len(faults))
+    for e in range(n):
+        if e < len(P):
+            invert(P[e], excess, a, I)
+        healthy = informative(I, z[e], Iz)
+        nearest_points(I, Iz, faults, offset, direction, low, high, J, m[e], work)
+        cost[e, 0] = healthy
+        for s in range(len(faults)):
+            cost[e, labels[s]] = J[s] + healthy
+        state = label[e], over[e], other[e], under[e], last[e]
+        if informed[e] and k[e] > after[4]:
+            state = declared(cost[e], penalty, statistic[e : e + 1], limit, after, *state)
         label1[e], over1[e], other1[e], under1[e], last1[e] = state
         alarm[e] = state[0] > 0
