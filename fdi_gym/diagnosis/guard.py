@@ -36,19 +36,17 @@ def examiner(plant: Plant) -> Callable[[int, Any], Examined]:
         if not isinstance(said, Diagnosis):
             raise ValueError(f"update returns (state, Diagnosis), not a {type(said).__name__}")
         alarm, label = _copied("alarm", said.alarm, (n,), "b"), _copied("label", said.label, (n,), "iu")
-        estimate, std, probs, state = (
+        parts = [
             None if part is None else _copied(name, part, (n, width), "iuf")
             for name, part, width in zip(_NUMBERS, said[2:6], widths, strict=True)
-        )
+        ]
         wrong, none = np.empty(n, bool), np.empty((n, 0))
-        found = compiled.look(
-            label, labels, none if estimate is None else estimate, none if std is None else std,
-            none if probs is None else probs, none if state is None else state, most, largest, SUM, wrong,
-        )  # fmt: skip
+        estimate, std, probs, state = (none if part is None else part for part in parts)
+        found = compiled.look(label, labels, estimate, std, probs, state, most, largest, SUM, wrong)
         if found < 0:
             unknown = label[(label < 0) | (label >= labels)][0]
             raise ValueError(f"a diagnosis has labels in 0..{labels - 1}, not {int(unknown)}")
-        return Diagnosis(alarm, label, estimate, std, probs, state, said.signals), wrong, found > 0
+        return Diagnosis(alarm, label, *parts, said.signals), wrong, found > 0
 
     return examined
 
