@@ -29,29 +29,30 @@ def examiner(plant: Plant) -> Callable[[int, Any], Examined]:
         ValueError: A shape or a type that no diagnosis has, or a label that the plant does not have; the field is named.
     """
     most, largest = (LARGE * np.array([s.scale for s in signals]) for signals in (plant.estimated, plant.states))
-    labels = len(plant.labels)
-    widths = len(plant.estimated), len(plant.estimated), labels, len(plant.states)
+    labels, p, n_x = len(plant.labels), len(plant.estimated), len(plant.states)
 
     def examined(n: int, said: Any) -> Examined:
         if not isinstance(said, Diagnosis):
             raise ValueError(f"update returns (state, Diagnosis), not a {type(said).__name__}")
         alarm, label = _copied("alarm", said.alarm, (n,), "b"), _copied("label", said.label, (n,), "iu")
-        parts = [
-            None if part is None else _copied(name, part, (n, width), "iuf")
-            for name, part, width in zip(_NUMBERS, said[2:6], widths, strict=True)
-        ]
+        _, _, estimate, std, probs, state, signals = said
+        estimate = None if estimate is None else _copied("estimate", estimate, (n, p), "iuf")
+        std = None if std is None else _copied("estimate_std", std, (n, p), "iuf")
+        probs = None if probs is None else _copied("label_probs", probs, (n, labels), "iuf")
+        state = None if state is None else _copied("state", state, (n, n_x), "iuf")
         wrong, none = np.empty(n, bool), np.empty((n, 0))
-        estimate, std, probs, state = (none if part is None else part for part in parts)
-        found = compiled.look(label, labels, estimate, std, probs, state, most, largest, SUM, wrong)
+        found = compiled.look(
+            label, labels, none if estimate is None else estimate, none if std is None else std,
+            none if probs is None else probs, none if state is None else state, most, largest, SUM, wrong,
+        )  # fmt: skip
         if found < 0:
             unknown = label[(label < 0) | (label >= labels)][0]
             raise ValueError(f"a diagnosis has labels in 0..{labels - 1}, not {int(unknown)}")
-        return Diagnosis(alarm, label, *parts, said.signals), wrong, found > 0
+        return Diagnosis(alarm, label, estimate, std, probs, state, signals), wrong, found > 0
 
     return examined
 
 
-_NUMBERS = Diagnosis._fields[2:6]
 _TYPES = {"b": (np.dtype(bool), "bool"), "iu": (np.dtype(np.int64), "integer"), "iuf": (np.dtype(float), "numbers, or None")}
 
 

@@ -201,7 +201,7 @@ def by_labels(
     none, labels, (h, _, f) = np.zeros(0), len(plant.labels), sets.direction.shape
 
     def start(n: int) -> Any:
-        return undeclared(n), None
+        return np.zeros((n, 5), np.int64), None  # the automata, and the statistic
 
     def step(state: Any, k: Array, r: Reading, informed: Array) -> tuple[Any, Verdict]:
         declared, tested = state
@@ -209,21 +209,23 @@ def by_labels(
         if statistic is not None:
             tested = statistic.start(n, r.nu.shape[1] if r.nu is not None else m) if tested is None else tested
             tested, rise = statistic.step(tested, r, informed & (k > after.warmup))
-        following, alarm = Automaton(*[np.empty(n, np.int64) for _ in declared]), np.empty(n, bool)
-        told = (penalty, none if rise is None else rise, limit, lengths, k, informed, *declared)
+        following, label, alarm = np.empty((n, 5), np.int64), np.empty(n, np.int64), np.empty(n, bool)
+        told = (
+            penalty, none if rise is None else rise, limit, lengths, k, informed, declared, following, label, alarm,
+        )  # fmt: skip
         z = None
         if r.cost is not None:
             cost = contiguous(r.cost)
-            label_kernels.declare(cost, *told, *following, alarm)
+            label_kernels.declare(cost, *told)
         else:
             assert r.z is not None
             assert r.P is not None
             P = contiguous(r.P) if fixed is None else fixed
             cost, at = np.empty((n, labels)), np.empty((n, h, f))
-            label_kernels.judge(contiguous(r.z), P, excess, *sets, *told, cost, at, *following, alarm)
+            label_kernels.judge(contiguous(r.z), P, excess, *sets, *told, cost, at)
             if on_line:
-                z = (sets.points(at) * (sets.labels == following.label[:, None])[..., None]).sum(axis=1)
-        return (following, tested), Verdict(alarm, following.label, z, Evidence(cost, rise))
+                z = (sets.points(at) * (sets.labels == label[:, None])[..., None]).sum(axis=1)
+        return (following, tested), Verdict(alarm, label, z, Evidence(cost, rise))
 
     return Rule(start, step)
 

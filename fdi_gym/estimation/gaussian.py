@@ -61,9 +61,10 @@ class Corrected(NamedTuple):
 
 
 def _rule(name: str) -> int:
-    if name not in RULES:
+    rule = RULES.get(name)
+    if rule is None:
         raise ValueError(f"unknown rule {name!r}; there are {', '.join(RULES)}")
-    return RULES[name]
+    return rule
 
 
 def _call(kernel: Any, head: tuple[Any, ...], *arrays: Any) -> None:

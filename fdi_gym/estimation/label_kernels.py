@@ -9,7 +9,7 @@ from fdi_gym.estimation.automaton import advance
 from fdi_gym.estimation.compiled import box_minimum, eliminate, helper
 from fdi_gym.kernels import M, V, compiled
 
-I1, B1, M3 = int64[::1], boolean[::1], float64[:, :, ::1]
+I1, I2, B1, M3 = int64[::1], int64[:, ::1], boolean[::1], float64[:, :, ::1]
 SETS = (I1, M, M3, M, M)  # faults, offset, direction, low, high: of the sets, as in `labels.Manifolds`
 
 
@@ -121,11 +121,8 @@ def gain(cost, penalty):
 
 
 @helper
-def declared(cost, penalty, statistic, limit, after, label, over, other, under, last):
-    """One automaton one sample later, from the costs (labels,) and what each label must gain.
-
-    The statistic (1,), where there is one (else (0,)), takes the place of the costs in raising an alarm.
-    """
+def declared(cost, penalty, statistic, limit, after, state, state1):
+    """An automaton, the five integers of `automaton.advance`, one sample later, as of `declare`; statistic (1,) or (0,)."""
     rise, switch, release, same = after[0], after[1], after[2], after[3] > 0
     if same:  # health is a label like the others
         best = lowest(cost, penalty, 0)
@@ -133,32 +130,29 @@ def declared(cost, penalty, statistic, limit, after, label, over, other, under, 
     else:
         best, share = lowest(cost, penalty, 1), gain(cost, penalty)
         above, below = statistic[0] > limit if statistic.size else share > 1.0, share < 0.5
-    return advance(label, over, other, under, last, best, above, below, rise, switch, release, same)
+    label, over, other, under, last = state[0], state[1], state[2], state[3], state[4]
+    new = advance(label, over, other, under, last, best, above, below, rise, switch, release, same)
+    state1[0], state1[1], state1[2], state1[3], state1[4] = new
 
 
-@compiled(void(M, V, V, float64, I1, I1, B1, I1, I1, I1, I1, I1, I1, I1, I1, I1, I1, B1))
-def declare(
-    cost, penalty, statistic, limit, after, k, informed, label, over, other, under, last,
-    label1, over1, other1, under1, last1, alarm,
-):  # fmt: skip
-    """The automata one sample later, and whether they alarm, from the costs (n, labels) and what each label must gain.
+@compiled(void(M, V, V, float64, I1, I1, B1, I2, I2, I1, B1))
+def declare(cost, penalty, statistic, limit, after, k, informed, state, state1, label, alarm):
+    """The automata (n, 5) one sample later, and what they declare, from the costs (n, labels) and what each label must gain.
 
-    The statistic (n,), where there is one, takes the place of the costs in raising an alarm. after: rise, switch, release,
-    same and warmup of a persistence.
+    The statistic (n,), where there is one (else (0,)), takes the place of the costs in raising an alarm. after: rise,
+    switch, release, same and warmup of a persistence.
     """
     for e in range(len(cost)):
-        state = label[e], over[e], other[e], under[e], last[e]
+        state1[e] = state[e]
         if informed[e] and k[e] > after[4]:
-            state = declared(cost[e], penalty, statistic[e : e + 1], limit, after, *state)
-        label1[e], over1[e], other1[e], under1[e], last1[e] = state
-        alarm[e] = state[0] > 0
+            declared(cost[e], penalty, statistic[e : e + 1], limit, after, state[e], state1[e])
+        label[e], alarm[e] = state1[e, 0], state1[e, 0] > 0
 
 
-@compiled(void(M, M3, M, I1, *SETS, V, V, float64, I1, I1, B1, I1, I1, I1, I1, I1, M, M3, I1, I1, I1, I1, I1, B1))
+@compiled(void(M, M3, M, I1, *SETS, V, V, float64, I1, I1, B1, I2, I2, I1, B1, M, M3))
 def judge(
     z, P, excess, labels, faults, offset, direction, low, high,
-    penalty, statistic, limit, after, k, informed, label, over, other, under, last,
-    cost, m, label1, over1, other1, under1, last1, alarm,
+    penalty, statistic, limit, after, k, informed, state, state1, label, alarm, cost, m,
 ):  # fmt: skip
     """`distances` as the costs of `declare`: of health, and of set s at labels[s]."""
     n, p = z.shape
@@ -167,13 +161,11 @@ def judge(
     for e in range(n):
         if e < len(P):
             invert(P[e], excess, a, I)
-        healthy = informative(I, z[e], Iz)
+        cost[e, 0] = informative(I, z[e], Iz)
         nearest_points(I, Iz, faults, offset, direction, low, high, J, m[e], work)
-        cost[e, 0] = healthy
         for s in range(len(faults)):
-            cost[e, labels[s]] = J[s] + healthy
-        state = label[e], over[e], other[e], under[e], last[e]
+            cost[e, labels[s]] = J[s] + cost[e, 0]
+        state1[e] = state[e]
         if informed[e] and k[e] > after[4]:
-            state = declared(cost[e], penalty, statistic[e : e + 1], limit, after, *state)
-        label1[e], over1[e], other1[e], under1[e], last1[e] = state
-        alarm[e] = state[0] > 0
+            declared(cost[e], penalty, statistic[e : e + 1], limit, after, state[e], state1[e])
+        label[e], alarm[e] = state1[e, 0], state1[e, 0] > 0
