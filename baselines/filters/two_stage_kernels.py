@@ -25,13 +25,11 @@ def solved(S, N):
 def product(A, B):
     """A B: for matrices of this size a call of BLAS costs several times what the loops do."""
     (n, m), r = A.shape, B.shape[1]
-    C = np.empty((n, r))
+    C = np.zeros((n, r))
     for i in range(n):
-        for j in range(r):
-            total = 0.0
-            for k in range(m):
-                total += A[i, k] * B[k, j]
-            C[i, j] = total
+        for k in range(m):
+            for j in range(r):
+                C[i, j] += A[i, k] * B[k, j]
     return C
 
 
