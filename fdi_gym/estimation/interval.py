@@ -41,7 +41,7 @@ class Interval(NamedTuple):
         if self.Q_held is None:
             return Q
         n, n_x, _ = self.Q_held.shape
-        rows = rows or n
+        rows = n if rows is None else rows
         found = np.tile(Q if Q.ndim == 3 else Q[None], (rows // (len(Q) if Q.ndim == 3 else 1), 1, 1))
         found[:, :n_x, :n_x] += np.repeat(self.Q_held, rows // n, axis=0)
         return found
