@@ -71,7 +71,7 @@ def general(plant: Plant, rule: str, sensors: range, walk: float) -> Filter:
     Q = np.diag([*np.maximum(np.diag(plant.Q), floor), *[walk**2] * p])
     P0 = np.diag([*(0.01 * scale[:n_x]) ** 2, *[0.01] * p])
     X0 = np.concatenate([plant.trim_state, np.zeros(p)])
-    return Filter(plant, model, rule, X0, P0, Q, plant.R[:m, :m])
+    return Filter(plant, model, rule, X0, P0, Q, np.ascontiguousarray(plant.R[:m, :m]))
 
 
 def bare(flt: Filter, obs: np.ndarray) -> np.ndarray:

@@ -65,11 +65,11 @@ LAST = {
 
 def test_two_stage_check_values():
     for (s, nis), (x, z, pz, expected) in zip(five_steps("none"), CONSTANT, strict=True):
-        assert s.state()[0] == pytest.approx(x, rel=1e-9, abs=1e-13)
+        assert s.optimal()[0][0] == pytest.approx(x, rel=1e-9, abs=1e-13)
         assert s.z[0] == pytest.approx(z, rel=1e-9, abs=1e-13)
         assert np.diag(s.Pz[0]) == pytest.approx(pz, rel=1e-9)
         assert nis == pytest.approx(expected, rel=1e-9)
-    assert np.trace(s.covariance()[0]) == pytest.approx(0.006720280822280349, rel=1e-9)
+    assert np.trace(s.optimal()[1][0]) == pytest.approx(0.006720280822280349, rel=1e-9)
     assert s.V[0] == pytest.approx(np.array([
         [-6.403857301677e-03, +2.231178705357e-03, -1.195807168562e-02, +3.916850789293e-02],
         [-1.041663537861e-02, -8.046661759198e-04, -1.820881304741e-02, -1.095187588311e-02],
@@ -81,7 +81,7 @@ def test_two_stage_check_values():
 def test_forgetting_check_values(rule):
     s, nis = five_steps(rule)[-1]
     x, z, pz, expected, J = LAST[rule]
-    assert s.state()[0] == pytest.approx(x, rel=1e-9)
+    assert s.optimal()[0][0] == pytest.approx(x, rel=1e-9)
     assert s.z[0] == pytest.approx(z, rel=1e-9)
     assert np.diag(s.Pz[0]) == pytest.approx(pz, rel=1e-9)
     assert nis == pytest.approx(expected, rel=1e-9)
@@ -177,8 +177,8 @@ def test_filter_is_consistent_on_fault_free_flights():
     nees, nis = np.zeros((2, steps))
     for k, s in enumerate(states(plant, filter, record.obs[:, : steps + 1], begun)):
         if k:
-            error = record.state[:, k] - s.state()
-            nees[k - 1] = np.einsum("ni,nij,nj->n", error, np.linalg.inv(s.covariance()), error).mean()
+            error = record.state[:, k] - s.optimal()[0]
+            nees[k - 1] = np.einsum("ni,nij,nj->n", error, np.linalg.inv(s.optimal()[1]), error).mean()
             nis[k - 1] = np.einsum("ni,nij,nj->n", s.nu, np.linalg.inv(s.S), s.nu).mean()
     low, high = chi2.ppf([0.0005, 0.9995], 4 * n) / n
     # the bias is exactly its prior mean, so the filter is cautious: never too confident

@@ -17,7 +17,8 @@ from fdi_gym.discovery import load_plant
 from fdi_gym.engine import no_noise, simulate
 from fdi_gym.estimation.belief import Belief, fault_inputs
 from fdi_gym.estimation.calibration import Calibration
-from fdi_gym.estimation.decision import Reading, by_channels
+from fdi_gym.estimation.channels import by_channels
+from fdi_gym.estimation.decision import Reading
 from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.labels import channel_sets, label_of_channels
 from fdi_gym.estimation.linear import linear_output

@@ -25,14 +25,16 @@ def test_a_sample_is_taken_apart(plant_id):
         last_known = rng.standard_normal((n, len(plant.known)))
         y, u, known = plant.split(obs)
         seen, heard, held = np.empty(y.shape, bool), np.empty(n, bool), np.empty(n, bool)
+        following = np.empty(n, np.int64)
         out = [np.empty(a.shape) for a in (y, u, known, u)]
         flags = compiled.receive(
-            obs, np.full(n, k0), np.ones(n, bool), last_u, last_known, last_stale, out[0], seen, *out[1:], heard, held
+            obs, np.full(n, k0), np.ones(n, bool), last_u, last_known, last_stale, following, out[0], seen, *out[1:],
+            heard, held,
         )  # fmt: skip
-        for found, expected in zip((*out, seen, heard, held), (
+        for found, expected in zip((*out, seen, heard, held, following), (
             np.nan_to_num(y), np.where(np.isnan(u), last_u, u), np.where(np.isnan(known), last_known, known),
             np.where(np.isnan(u), last_stale + 1, 0.0), np.isfinite(y), np.isfinite(y).any(axis=1),
-            np.isnan(obs[:, n_y:]).any(axis=1),
+            np.isnan(obs[:, n_y:]).any(axis=1), np.full(n, k0 + 1),
         ), strict=True):  # fmt: skip
             assert np.array_equal(found, expected)
         assert bool(flags & compiled.RUNNING) == (k0 > 0)

@@ -7,21 +7,32 @@ bias; for a bias that moves it is not, since the bias-free covariance misses wha
 from __future__ import annotations
 
 import numpy as np
+from numba import void
 
+from baselines.filters.two_stage_kernels import M3, product, symmetric, times
 from baselines.filters.two_stage_kf import TwoStage, decision_rule, initial_covariances, read, start
 from baselines.filters.two_stage_kf import correct as two_stage_correct
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.estimation.kalman import symmetric, times
-from fdi_gym.estimation.linear import LinearModel, linear_model
+from fdi_gym.estimation.linear import LinearModel, linear_model, stacked
+from fdi_gym.kernels import M, compiled
 from fdi_gym.plant import Array, Plant
+
+
+@compiled(void(M, M3, M3, M, M, M, M, M3, M3, M, M3, M3))
+def _predict(x, Px, V, u, A, B, E_0, E_u, Q, x1, Px1, V1):
+    for k in range(len(x)):
+        E = E_0.copy()
+        for j in range(len(E_u)):
+            E += u[k, j] * E_u[j]
+        x1[k], V1[k] = times(A, x[k]) + times(B, u[k]), product(A, V[k]) + E
+        Px1[k] = symmetric(product(product(A, Px[k]), A.T) + Q[k % len(Q)])
 
 
 def predict(s: TwoStage, u: Array, model: LinearModel, Q: Array, Qz: Array) -> TwoStage:
     """Over the interval under the command u (n, n_u): the bias-free state as if there were no bias."""
-    A = model.A
-    return s._replace(
-        x=times(A, s.x) + times(model.B, u), Px=symmetric(A @ s.Px @ A.T + Q), Pz=s.Pz + Qz, V=A @ s.V + model.E(u)
-    )
+    x, Px, V = np.empty(s.x.shape), np.empty(s.Px.shape), np.empty(s.V.shape)
+    _predict(s.x, s.Px, s.V, u, *model.equations, stacked(Q), x, Px, V)
+    return s._replace(x=x, Px=Px, Pz=s.Pz + Qz, V=V)
 
 
 @diagnoser("friedland_kf", "Friedland's bias-separated filter")

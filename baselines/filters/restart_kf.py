@@ -61,7 +61,8 @@ def restart_kf(
         decision, verdict = rule.step(s.decision, at.k, detector.read(first), np.asarray(seen.any(axis=1)))
         rises = verdict.alarm & ~s.alarm
         if rises.any():
-            fresh = start(len(y), len(plant.outputs), P_x, P_z)._replace(x=first.state(), Px=first.covariance())
+            x, Px = first.optimal()
+            fresh = start(len(y), len(plant.outputs), P_x, P_z)._replace(x=x, Px=Px)
             other = choose(rises, fresh, other)
         return Restarted(first, other, decision, verdict.alarm)
 
@@ -71,7 +72,7 @@ def restart_kf(
         cost[:, sets.labels] = np.where(s.alarm[:, None], fits.J[:, 1:], np.inf)
         cost[:, 0] = np.where(s.alarm, np.inf, 0.0)
         z, filter = np.where(s.alarm[:, None], s.second.z, 0.0), s.detector
-        return Reading(z, s.second.Pz, filter.state(), filter.covariance(), filter.nu, filter.S, filter.seen, cost)
+        return Reading(z, s.second.Pz, *filter.optimal(), filter.nu, filter.S, filter.seen, cost)
 
     filter = Filter(begin, predict, update, read, first_sample=False)
     return diagnoser_of(plant, filter, by_candidate(lambda r, label: np.argmin(np.asarray(r.cost), axis=1), 1))

@@ -17,15 +17,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from baselines.filters import two_stage_kernels as kernels
 from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser, diagnoser_of
 from fdi_gym.estimation.calibration import Persistence, uniform
 from fdi_gym.estimation.decision import Reading, Rule, by_candidate, by_labels
-from fdi_gym.estimation.kalman import T, masked, right_divide, symmetric, times
-from fdi_gym.estimation.linear import LinearModel, linear_model
+from fdi_gym.estimation.linear import LinearModel, linear_model, stacked
+from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, Plant
 
 WARMUP = 150  # samples without a decision: the filter converges
-FORGETTING = ("none", "directional", "exponential")
+FORGETTING = ("none", "directional", "exponential")  # in the order of the kernels' numbers
 
 
 class TwoStage(NamedTuple):
@@ -40,13 +41,11 @@ class TwoStage(NamedTuple):
     S: Array  # (n, n_y, n_y) its covariance
     seen: Array  # (n,) sensors in it
 
-    def state(self) -> Array:
-        """The optimal state estimate x + V z, eq. 40."""
-        return self.x + times(self.V, self.z)
-
-    def covariance(self) -> Array:
-        """Its covariance Px + V Pz V', eq. 41."""
-        return self.Px + self.V @ self.Pz @ T(self.V)
+    def optimal(self) -> tuple[Array, Array]:
+        """The optimal state estimate (n, n_x) and its covariance (n, n_x, n_x), eqs. 40 and 41."""
+        X, P = np.empty(self.x.shape), np.empty(self.Px.shape)
+        kernels.optimal(self.x, self.Px, self.z, self.Pz, self.V, X, P)
+        return X, P
 
 
 def start(n: int, n_y: int, P_x: Array, P_z: Array) -> TwoStage:
@@ -58,28 +57,18 @@ def start(n: int, n_y: int, P_x: Array, P_z: Array) -> TwoStage:
     )  # fmt: skip
 
 
-def forget(Pz: Array, rule: str, factor: float, a_min: float, a_max: float) -> Array:
-    """The time update of the fault parameter's covariance under forgetting, eigenvalue by eigenvalue.
+def forget(Pz: Array, rule: str, factor: float, a_min: float, a_max: float, q_bias: float = 0.0) -> Array:
+    """The time update of the fault parameter's covariance (n, p, p): forgetting, then a random walk.
 
-    "directional" (bounded): a -> a_min + a (a_max - a_min) / a_max below a_max. "exponential" (capped): a -> a / factor
-    up to a_max. An eigenvalue above a_max stays. "none": nothing happens.
+    Eigenvalue by eigenvalue: "directional" (bounded): a -> a_min + a (a_max - a_min) / a_max below a_max. "exponential"
+    (capped): a -> a / factor up to a_max. An eigenvalue above a_max stays. "none": nothing happens.
 
     Below the cap both rules are linear in Pz and need no eigenvalues; the Frobenius norm bounds the largest one.
     """
-    if rule == "none":
+    if rule == "none" and not q_bias:
         return Pz
-    if rule == "directional":
-        limit, aged = a_max, a_min * np.eye(Pz.shape[-1]) + Pz * ((a_max - a_min) / a_max)
-    else:
-        limit, aged = factor * a_max, Pz / factor
-    capped = (Pz * Pz).sum(axis=(1, 2)) > limit * limit
-    if capped.any():
-        a, e = np.linalg.eigh(symmetric(Pz[capped]))
-        if rule == "directional":
-            a = np.where(a <= a_max, a_min + a * (a_max - a_min) / a_max, a)
-        else:
-            a = np.maximum(a, np.minimum(a / factor, a_max))
-        aged[capped] = (e * a[:, None, :]) @ T(e)
+    aged = np.empty(Pz.shape)
+    kernels.forget(contiguous(Pz), FORGETTING.index(rule), factor, a_min, a_max, q_bias, aged)
     return aged
 
 
@@ -93,45 +82,28 @@ def aging(
     """
     if forgetting not in FORGETTING:
         raise ValueError(f"unknown forgetting {forgetting!r}; there are {', '.join(FORGETTING)}")
-    Qz = q_bias * np.eye(len(plant.theta))
-
-    def aged(Pz: Array) -> Array:
-        forgotten = forget(Pz, forgetting, factor, a_min, a_max)
-        return forgotten + Qz if q_bias else forgotten
-
-    return aged
+    return lambda Pz: forget(Pz, forgetting, factor, a_min, a_max, q_bias)
 
 
 def predict(s: TwoStage, u: Array, model: LinearModel, Q: Array, Pz_minus: Array) -> TwoStage:
     """Over the interval under the command u_k (n, n_u), eqs. 24 to 31; Pz_minus (n, p, p) is the aged Pz."""
-    A = model.A
-    W = A @ s.V + model.E(u)
-    WPz = W @ s.Pz
-    V = W if Pz_minus is s.Pz else right_divide(WPz, Pz_minus)
-    x = times(A, s.x) + times(model.B, u) + times(W - V, s.z)
-    # W Pz W' - V Pz- V', with V Pz- = W Pz
-    Px = symmetric(A @ s.Px @ A.T + Q + WPz @ T(W - V))
-    return s._replace(x=x, Px=Px, Pz=Pz_minus, V=V)
+    x, Px, V = np.empty(s.x.shape), np.empty(s.Px.shape), np.empty(s.V.shape)
+    kernels.predict(
+        s.x, s.Px, s.z, s.Pz, s.V, Pz_minus, Pz_minus is s.Pz, u, *model.equations, stacked(Q), x, Px, V
+    )  # fmt: skip
+    return TwoStage(x, Px, s.z, Pz_minus, V, s.nu, s.S, s.seen)
 
 
 def correct(s: TwoStage, y: Array, seen: Array, C: Array, R: Array) -> TwoStage:
     """With the measurement y_{k+1} of the sensors that reported (n, n_y), eqs. 32 to 41."""
-    cross = s.Px @ C.T
-    r, S, cross, Ht = masked(seen, y - times(C, s.x), C @ cross + R, cross, T(C @ s.V))
-    H, Kx = T(Ht), right_divide(cross, S)
-    PzHt = s.Pz @ Ht
-    Sz = H @ PzHt + S
-    Kz = right_divide(PzHt, Sz)
-    nu = r - times(H, s.z)
-    return TwoStage(
-        s.x + times(Kx, r), symmetric(s.Px - Kx @ T(cross)), s.z + times(Kz, nu), symmetric(s.Pz - Kz @ T(PzHt)),
-        s.V - Kx @ H, nu, Sz, seen.sum(axis=1),
-    )  # fmt: skip
+    new = TwoStage(*(np.empty(a.shape, a.dtype) for a in s))
+    kernels.correct(s.x, s.Px, s.z, s.Pz, s.V, y, seen, C, contiguous(R), *new)
+    return new
 
 
 def read(s: TwoStage) -> Reading:
     """What the filter knows."""
-    return Reading(s.z, s.Pz, s.state(), s.covariance(), s.nu, s.S, s.seen)
+    return Reading(s.z, s.Pz, *s.optimal(), s.nu, s.S, s.seen)
 
 
 def two_stage_filter(plant: Plant, aged: Callable[[Array], Array]) -> Filter:

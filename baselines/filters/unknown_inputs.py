@@ -14,7 +14,8 @@ import numpy as np
 from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser_of
 from fdi_gym.estimation.belief import Belief, FaultInputs, fault_inputs, noisy_sensors
 from fdi_gym.estimation.calibration import Calibration
-from fdi_gym.estimation.decision import Reading, by_channels, by_labels
+from fdi_gym.estimation.channels import by_channels
+from fdi_gym.estimation.decision import Reading, by_labels
 from fdi_gym.estimation.labels import tells_apart
 from fdi_gym.estimation.linear import linear_output
 from fdi_gym.plant import Array, Plant

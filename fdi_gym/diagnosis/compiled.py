@@ -11,20 +11,20 @@ I1, B1, B2 = int64[::1], boolean[::1], boolean[:, ::1]
 HELD, STALE, RUNNING = 1, 2, 4  # flags of `receive`
 
 
-@compiled(int64(M, I1, B1, M, M, M, M, B2, M, M, M, B1, B1))
-def receive(obs, k, begun, last_u, last_known, last_stale, y, seen, u, known, stale, heard, held):
+@compiled(int64(M, I1, B1, M, M, M, I1, M, B2, M, M, M, B1, B1))
+def receive(obs, k, begun, last_u, last_known, last_stale, following, y, seen, u, known, stale, heard, held):
     """Take observations (n, n_obs) apart, with the last value of a command or known signal that did not report.
 
-    Writes y and seen (n, n_y), u and stale (n, n_u), known (n, n_known), and per episode whether any sensor and whether
-    all commands and known signals reported (`held`: not). Returns flags: HELD and STALE, somewhere something is held, or a
-    command; RUNNING, all episodes have begun and are beyond their first sample.
+    Writes the number of the sample after (n,), y and seen (n, n_y), u and stale (n, n_u), known (n, n_known), and whether
+    any sensor and whether all commands and known signals reported (n,) (`held`: not). Returns flags: HELD and STALE,
+    somewhere something is held, or a command; RUNNING, all episodes have begun and are beyond their first sample.
     """
     flags = RUNNING
     (n, n_y), n_u = y.shape, u.shape[1]
     for e in range(n):
         if not begun[e] or k[e] == 0:
             flags &= ~RUNNING
-        heard[e], held[e] = False, False
+        following[e], heard[e], held[e] = k[e] + 1, False, False
         for i in range(n_y):
             value = obs[e, i]
             seen[e, i] = np.isfinite(value)

@@ -95,8 +95,10 @@ def shell(plant: Plant, filter: Filter, rule: Rule) -> tuple[Callable[[int], Run
     def step(s: Running, obs: Array) -> tuple[Running, Reading, Verdict]:
         n = len(obs)
         y, seen, heard, held = np.empty((n, n_y)), np.empty((n, n_y), bool), np.empty(n, bool), np.empty(n, bool)
-        u, stale, known = np.empty((n, n_u)), np.empty((n, n_u)), np.empty((n, n_known))
-        flags = compiled.receive(contiguous(obs), s.k, s.begun, s.u, s.known, s.stale, y, seen, u, known, stale, heard, held)
+        u, stale, known, following = np.empty((n, n_u)), np.empty((n, n_u)), np.empty((n, n_known)), np.empty(n, np.int64)
+        flags = compiled.receive(
+            contiguous(obs), s.k, s.begun, s.u, s.known, s.stale, following, y, seen, u, known, stale, heard, held
+        )
         at = interval(s, u, known, held if flags & compiled.HELD else None, stale if flags & compiled.STALE else None)
         if flags & compiled.RUNNING == compiled.RUNNING:
             state, begun, measures = filter.predict(s.filter, at), s.begun, None
@@ -112,7 +114,7 @@ def shell(plant: Plant, filter: Filter, rule: Rule) -> tuple[Callable[[int], Run
         if at.stale is not None:  # what a command that did not report has changed is no evidence of a fault
             informed = informed & (at.stale == 0).all(axis=1)
         ruled, verdict = rule.step(s.rule, s.k, reading, informed)
-        return Running(s.k + 1, begun, u, stale, known, state, ruled), reading, verdict
+        return Running(following, begun, u, stale, known, state, ruled), reading, verdict
 
     return start, step
 

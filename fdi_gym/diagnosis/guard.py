@@ -30,17 +30,17 @@ def examiner(plant: Plant) -> Callable[[int, Any], Examined]:
         ValueError: A shape or a type that no diagnosis has, or a label that the plant does not have; the field is named.
     """
     most, largest = (LARGE * np.array([s.scale for s in signals]) for signals in (plant.estimated, plant.states))
-    labels = len(plant.labels)
-    widths = len(plant.estimated), len(plant.estimated), labels, len(plant.states)
+    labels, p, n_x = len(plant.labels), len(plant.estimated), len(plant.states)
 
     def examined(n: int, said: Any) -> Examined:
         if not isinstance(said, Diagnosis):
             raise ValueError(f"update returns (state, Diagnosis), not a {type(said).__name__}")
         alarm, label = _copied("alarm", said.alarm, (n,), "b"), _copied("label", said.label, (n,), "iu")
-        estimate, std, probs, state = (
-            None if part is None else _copied(name, part, (n, width), "iuf")
-            for name, part, width in zip(_NUMBERS, said[2:6], widths, strict=True)
-        )
+        _, _, estimate, std, probs, state, signals = said
+        estimate = None if estimate is None else _copied("estimate", estimate, (n, p), "iuf")
+        std = None if std is None else _copied("estimate_std", std, (n, p), "iuf")
+        probs = None if probs is None else _copied("label_probs", probs, (n, labels), "iuf")
+        state = None if state is None else _copied("state", state, (n, n_x), "iuf")
         wrong, none = np.empty(n, bool), np.empty((n, 0))
         found = compiled.look(
             label, labels, none if estimate is None else estimate, none if std is None else std,
@@ -49,18 +49,19 @@ def examiner(plant: Plant) -> Callable[[int, Any], Examined]:
         if found < 0:
             unknown = label[(label < 0) | (label >= labels)][0]
             raise ValueError(f"a diagnosis has labels in 0..{labels - 1}, not {int(unknown)}")
-        return Diagnosis(alarm, label, estimate, std, probs, state, said.signals), wrong, found > 0
+        return Diagnosis(alarm, label, estimate, std, probs, state, signals), wrong, found > 0
 
     return examined
 
 
-_NUMBERS = Diagnosis._fields[2:6]
-_TYPES = {"b": (np.bool_, "bool"), "iu": (np.int64, "integer"), "iuf": (np.float64, "numbers, or None")}
+_TYPES = {"b": (np.dtype(bool), "bool"), "iu": (np.dtype(np.int64), "integer"), "iuf": (np.dtype(float), "numbers, or None")}
 
 
 def _copied(name: str, given: Any, shape: tuple[int, ...], kinds: str) -> Array:
     """A field in its declared type; a copy, so that nobody who is told it reaches into the method's state."""
     dtype, what = _TYPES[kinds]
+    if type(given) is np.ndarray and given.dtype == dtype and given.shape == shape:
+        return given.copy()
     value = np.array(given, order="C")
     if value.shape != shape or value.dtype.kind not in kinds:
         raise ValueError(f"a diagnosis has {name} of shape {shape} and {what}, not {value.shape} of {value.dtype}")
@@ -117,10 +118,8 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
             )
         if n == 0:
             return state, last
-        shown = ~lost
-        if not raw.gaps:
-            shown &= np.isfinite(obs).all(axis=1)
-        whole = bool(shown.all())
+        shown = ~lost if raw.gaps else ~lost & np.isfinite(obs).all(axis=1)
+        whole = np.count_nonzero(shown) == n
         if not whole:
             obs = np.where(shown[:, None], obs, last_obs)
         with np.errstate(all="ignore"):

@@ -21,6 +21,7 @@ from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T
 from fdi_gym.plant import Array, Plant
 
+NO_TIME = np.zeros(1)  # of what is a matrix: it is the same at all times
 WIDEST = 2.0  # the walk never makes a fault's standard deviation larger than this, in units of its typical size
 
 
@@ -66,6 +67,11 @@ class AugmentedModel:
             limit=self.limit, lines=self.lines, H=self.H,
         )  # fmt: skip
 
+    @functools.cached_property
+    def noises(self) -> tuple[Array, Array]:
+        """Q (1 or lines, N, N) and R (1, m, m) as the compiled steps take them."""
+        return self.Q if self.Q.ndim == 3 else self.Q[None], self.R[None]
+
     def f(self, X: Array, at: Interval) -> Array:
         """The points X (n, M, N) one sample later, without noise."""
         return gaussian.f(self.compiled, X, (at.k - 1) * self.plant.dt, at.u, at.d)
@@ -91,16 +97,19 @@ class AugmentedModel:
 
         The interval and the measurement may have fewer rows than X, each for equally many consecutive ones.
         """
-        Q = self.Q if self.Q.ndim == 3 else self.Q[None]
+        model, (Q, _) = self.compiled, self.noises
         if at.Q_held is not None:  # each episode has its own, as often as it has rows
             Q = at.noise(Q, len(X))
-        return gaussian.predict(self.compiled, rule, X, P, (at.k - 1) * self.plant.dt, at.u, at.d, Q)
+        t = NO_TIME if model.linear.size else (at.k - 1) * self.plant.dt
+        return gaussian.predict(model, rule, X, P, t, at.u, at.d, Q)
 
     def update(self, rule: str, X: Array, P: Array, at: Interval, y: Array, seen: Array) -> gaussian.Updated:
         """Update with the measurement y (n, n_y) of the sensors that reported, seen (n, n_y)."""
         if not self.hears_all:
             y, seen = y.take(self.sensors, axis=1), seen.take(self.sensors, axis=1)
-        return gaussian.update(self.compiled, rule, X, P, at.k * self.plant.dt, at.u, at.d, y, seen, self.R[None])
+        model, (_, R) = self.compiled, self.noises
+        t = NO_TIME if model.H.size else at.k * self.plant.dt
+        return gaussian.update(model, rule, X, P, t, at.u, at.d, y, seen, R)
 
 
 def _linear_sensors(model: AugmentedModel) -> Array | None:

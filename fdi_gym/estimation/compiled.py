@@ -108,6 +108,15 @@ def box_minimum(G, g, low, high, f, a, at, where, tried, m):
 
     a (f, f + 1), at, where (f,) int and tried (f,) are room to work in.
     """
+    if f == 1:  # most labels
+        m[0] = g[0] / G[0, 0]
+        if m[0] < low[0] - SLACK:
+            m[0] = low[0]
+        elif m[0] > high[0] + SLACK:
+            m[0] = high[0]
+        value = quadratic_form(G, g, f, m)
+        if value == value:
+            return value
     for j in range(f):
         at[j] = 0
     for _ in range(2 * f + 2):

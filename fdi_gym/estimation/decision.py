@@ -9,8 +9,9 @@ A rule is a pair of functions, `start(n)` and `step(state, k, reading, informed)
   "glr": generalised likelihood ratio of a jump in the mean of the whitened innovations at an unknown time within a
   window (M. Basseville, I. V. Nikiforov, Detection of Abrupt Changes, 1993).
   A filter that follows the fault soon explains its innovations again; they raise the alarm, the distance keeps it.
-- `by_candidate`: a label for every sample, which must persist;
-- `by_channels`: each entry of the fault vector smoothed and compared with a threshold; the set is the label.
+- `by_candidate`: a label for every sample, which must persist.
+
+`fdi_gym.estimation.channels` has one for filters whose estimate has an entry for each fault.
 
 A sample at which no sensor reported says nothing, and no counter moves.
 """
@@ -24,10 +25,9 @@ import numpy as np
 
 from fdi_gym.estimation import label_kernels
 from fdi_gym.estimation.automaton import Automaton, first, step
-from fdi_gym.estimation.belief import FaultInputs, noisy_sensors
 from fdi_gym.estimation.calibration import LEAST, Calibration, Persistence
 from fdi_gym.estimation.kalman import quadratic
-from fdi_gym.estimation.labels import channel_sets, distances, label_of_channels, manifolds
+from fdi_gym.estimation.labels import manifolds
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, Plant
 
@@ -198,35 +198,35 @@ def by_labels(
     m, p = len(plant.outputs), len(plant.estimated)
     excess = np.zeros((p, p)) if calibration.excess is None or fixed is not None else contiguous(calibration.excess)
     limit = np.inf if calibration.rise is None else calibration.rise
-    where = np.concatenate([[0], sets.labels])
-    in_order, back = bool((where == np.arange(len(where))).all()), np.argsort(where)
-    lengths = after.rise, after.switch, after.release, after.same
-    none = np.zeros(0)
+    lengths = np.array([after.rise, after.switch, after.release, after.same, after.warmup], np.int64)
+    none, labels, (h, _, f) = np.zeros(0), len(plant.labels), sets.direction.shape
 
     def start(n: int) -> Any:
-        return undeclared(n), None
+        return np.zeros((n, 5), np.int64), None  # the automata, and the statistic
 
     def step(state: Any, k: Array, r: Reading, informed: Array) -> tuple[Any, Verdict]:
         declared, tested = state
-        cost, found, rise = r.cost, None, None
-        if cost is None:
-            assert r.z is not None
-            assert r.P is not None
-            found = distances(r.z, r.P if fixed is None else fixed, sets, excess)
-            cost = found.J if in_order else found.J[:, back]
+        n, rise = len(k), None
         if statistic is not None:
-            tested = statistic.start(len(cost), r.nu.shape[1] if r.nu is not None else m) if tested is None else tested
+            tested = statistic.start(n, r.nu.shape[1] if r.nu is not None else m) if tested is None else tested
             tested, rise = statistic.step(tested, r, informed & (k > after.warmup))
-        n = len(cost)
-        following, alarm = Automaton(*np.empty((5, n), np.int64)), np.empty(n, bool)
-        label_kernels.declare(
-            contiguous(cost), penalty, none if rise is None else rise, limit, k, after.warmup, informed, *declared, *lengths,
-            *following, alarm,
+        following, label, alarm = np.empty((n, 5), np.int64), np.empty(n, np.int64), np.empty(n, bool)
+        told = (
+            penalty, none if rise is None else rise, limit, lengths, k, informed, declared, following, label, alarm,
         )  # fmt: skip
         z = None
-        if on_line and found is not None:
-            z = (sets.points(found.m) * (sets.labels == following.label[:, None])[..., None]).sum(axis=1)
-        return (following, tested), Verdict(alarm, following.label, z, Evidence(cost, rise))
+        if r.cost is not None:
+            cost = contiguous(r.cost)
+            label_kernels.declare(cost, *told)
+        else:
+            assert r.z is not None
+            assert r.P is not None
+            P = contiguous(r.P) if fixed is None else fixed
+            cost, at = np.empty((n, labels)), np.empty((n, h, f))
+            label_kernels.judge(contiguous(r.z), P, excess, *sets, *told, cost, at)
+            if on_line:
+                z = (sets.points(at) * (sets.labels == label[:, None])[..., None]).sum(axis=1)
+        return (following, tested), Verdict(alarm, label, z, Evidence(cost, rise))
 
     return Rule(start, step)
 
@@ -247,70 +247,3 @@ def by_candidate(candidate: Callable[[Reading, Array], Array], after: int, warmu
         return s, Verdict(s.label > 0, s.label)
 
     return Rule(undeclared, step)
-
-
-CHANNELS = Persistence(3, 1, 20)
-RECOVERED = 1.1  # estimates have got over a gap when their deviations are at most by this factor what they were before it
-FORGOTTEN = 10  # or after whole samples for so many time constants of the smoothing: then what they were is history
-
-
-class Smoothed(NamedTuple):
-    """State of `by_channels`: n episodes, p channels."""
-
-    value: Array  # (n, p) smoothed estimates
-    std: Array  # (n, p) their standard deviation, smoothed alike: errors of neighbouring samples are nearly the same
-    usual: Array  # (n, p) what that was before the gap; 0 before there are estimates
-    whole: Array  # (n, 1) whole samples since the last gap; without bound where the estimates have got over it
-    declared: Automaton
-
-
-def by_channels(plant: Plant, inputs: FaultInputs, alpha: float, thresholds: Array, after: Persistence = CHANNELS) -> Rule:
-    """Each entry of the fault vector, smoothed: s+ = (1 - alpha) s + alpha z; on above its threshold, off below half of it.
-
-    The label is the set of entries that are on. After a gap the estimates are less certain for a while, by their own
-    covariance; the threshold that turns a channel on is higher by the same factor until they are what they were.
-
-    Args:
-        plant: The plant.
-        inputs: The fault channels; the reading's z is of the whole estimated space.
-        alpha: Smoothing factor.
-        thresholds: One per channel (p,), in the unit of the estimate.
-        after: Samples in a row that switch a channel on and off.
-
-    Raises:
-        ValueError: Not one threshold per channel.
-    """
-    J = np.asarray(thresholds, float)
-    if J.shape != (len(inputs.names),):
-        raise ValueError(f"one threshold per channel ({', '.join(inputs.names)}) is needed, not {np.asarray(J).tolist()}")
-    labels, sets = channel_sets(plant, inputs)
-    every = len(noisy_sensors(plant))
-
-    def start(n: int) -> Smoothed:
-        nothing = np.zeros((n, len(J)))
-        return Smoothed(nothing, nothing, nothing, np.full((n, 1), np.inf), undeclared((n, len(J))))
-
-    def step(s: Smoothed, k: Array, r: Reading, informed: Array) -> tuple[Smoothed, Verdict]:
-        assert r.z is not None
-        assert r.P is not None
-        informed = (informed & (k > after.warmup))[:, None]
-        kept = 1 - alpha if r.span is None else ((1 - alpha) ** r.span)[:, None]
-        std = np.sqrt(np.maximum(np.einsum("npp->np", r.P)[:, inputs.estimated], 0.0))
-        value = np.where(informed, kept * s.value + (1 - kept) * r.z[:, inputs.estimated], s.value)
-        spread = np.where(informed, np.where(s.std > 0, kept * s.std + (1 - kept) * std, std), s.std)
-        missing = ~informed if r.seen is None else ~informed | (r.seen < every)[:, None]
-        whole = np.where(missing, 0.0, s.whole + 1.0)
-        over = ~missing & (spread <= RECOVERED * s.usual).all(axis=1, keepdims=True) | (whole * alpha > FORGOTTEN)
-        whole = np.where(over | (s.usual == 0).all(axis=1, keepdims=True), np.inf, whole)
-        usual = np.where(np.isinf(whole), spread, s.usual)
-        factor = np.maximum(spread / np.where(usual > 0, usual, 1.0), 1.0)
-        size = np.abs(value)
-        on = np.ones(size.shape, np.int64)
-        declared = declare(s.declared, on, size > factor * J, size < 0.5 * J, after, np.broadcast_to(informed, size.shape))
-        flagged = declared.label > 0
-        label = label_of_channels(labels, sets, flagged, size / J)
-        signals = {"smoothed": value, "channels_on": flagged}
-        verdict = Verdict(np.any(flagged, axis=1), label, evidence=Evidence(channels=size), signals=signals)
-        return Smoothed(value, spread, usual, whole, declared), verdict
-
-    return Rule(start, step)

@@ -29,11 +29,12 @@ def nearest(plant: Plant, y: Array, seen: Array, expected: Array) -> Array:
         expected: What they are expected to read (n, n_y); NaN where nothing is: then it is as reported.
     """
     found = y
-    periods = np.where(plant.periods > 0.0, plant.periods, np.inf)
-    turns = np.round((y - expected) / periods)
-    turns = np.where(seen & np.isfinite(turns), turns, 0.0)
-    if turns.any():
-        found = np.where(turns != 0.0, y - np.where(np.isfinite(periods), periods, 0.0) * turns, y)
+    if plant.periods.any():
+        periods = np.where(plant.periods > 0.0, plant.periods, np.inf)
+        turns = np.round((y - expected) / periods)
+        turns = np.where(seen & np.isfinite(turns), turns, 0.0)
+        if turns.any():
+            found = np.where(turns != 0.0, y - np.where(np.isfinite(periods), periods, 0.0) * turns, y)
     for quaternion in plant.quaternions:
         vector, sign = list(quaternion[:3]), quaternion[3]
         parts = [*vector, sign]

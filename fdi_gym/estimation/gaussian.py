@@ -62,13 +62,17 @@ class Corrected(NamedTuple):
 
 
 def _rule(name: str) -> int:
-    if name not in RULES:
+    rule = RULES.get(name)
+    if rule is None:
         raise ValueError(f"unknown rule {name!r}; there are {', '.join(RULES)}")
-    return RULES[name]
+    return rule
 
 
 def _call(kernel: Any, head: tuple[Any, ...], *arrays: Any) -> None:
-    """Call a kernel with the arrays in the order and type that it takes; a copy only of what is not so, or read-only."""
+    """Call a kernel with the arrays in the order and type that it takes; a copy only of what is not so, or read-only.
+
+    Slow where it has to copy: numba takes long to refuse. A caller whose arrays are parts of others makes them contiguous.
+    """
     try:
         kernel(*head, *arrays)
     except TypeError:
@@ -190,7 +194,9 @@ def correct(X: Array, P: Array, mean: Array, cross: Array, S: Array, y: Array, s
         ValueError: Shapes that do not fit.
     """
     n, m = mean.shape
+    # parts of larger arrays, most often: numba takes 300 us to say that it does not take them
+    X, P, y, mean, cross, S = (contiguous(a) for a in (X, P, y, mean, cross, S))
     X1, P1, K = np.empty(X.shape), np.empty(P.shape), np.empty((n, X.shape[1], m))
     nu, S1, nis, log = np.empty((n, m)), np.empty((n, m, m)), np.empty(n), np.empty(n)
-    _call(kernels.correct, (seen,), X, P, y, mean, cross, S, X1, P1, nu, S1, K, nis, log)
+    _call(kernels.correct, (np.ascontiguousarray(seen),), X, P, y, mean, cross, S, X1, P1, nu, S1, K, nis, log)
     return Corrected(X1, P1, nu, S1, nis, log, K)

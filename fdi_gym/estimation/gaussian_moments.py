@@ -61,26 +61,9 @@ def pass_points(moving, integers, reals, offset, direction, t, points, u, known,
             x[j] = points[i, j]
         if moving:
             interval(
-                dynamics,
-                project,
-                t,
-                dt,
-                substeps,
-                x,
-                u,
-                False,
-                theta,
-                still,
-                still,
-                d,
-                physical,
-                theta_now,
-                k1,
-                k2,
-                k3,
-                k4,
-                z,
-            )
+                dynamics, project, t, dt, substeps, x, u, False, theta, still, still, d, physical, theta_now,
+                k1, k2, k3, k4, z,
+            )  # fmt: skip
             for j in range(n_x):
                 values[i, j] = x[j]
         else:

@@ -9,16 +9,23 @@ from fdi_gym.estimation.automaton import advance
 from fdi_gym.estimation.compiled import box_minimum, eliminate, helper
 from fdi_gym.kernels import M, V, compiled
 
-I1, B1, M3 = int64[::1], boolean[::1], float64[:, :, ::1]
+I1, I2, B1, M3 = int64[::1], int64[:, ::1], boolean[::1], float64[:, :, ::1]
 SETS = (I1, M, M3, M, M)  # faults, offset, direction, low, high: of the sets, as in `labels.Manifolds`
 
 
 @helper
-def nearest_points(I, Iz, faults, offset, direction, low, high, value, m):  # noqa: E741 (the information)
-    """value[s] = min of q' I q - 2 q' Iz over q = offset[s] + direction[s] m[s] with m[s] in its box, for all sets s."""
-    sets, p, most = direction.shape
+def room(p, most):
+    """What `nearest_points` works in, for sets of up to `most` faults in p dimensions."""
     G, g, ID, Io = np.empty((most, most)), np.empty(most), np.empty((most, p)), np.empty(p)
     a, at, where, tried = np.empty((most, most + 1)), np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
+    return G, g, ID, Io, a, at, where, tried
+
+
+@helper
+def nearest_points(I, Iz, faults, offset, direction, low, high, value, m, room):  # noqa: E741 (the information)
+    """value[s] = min of q' I q - 2 q' Iz over q = offset[s] + direction[s] m[s] with m[s] in its box, for all sets s."""
+    sets, p, most = direction.shape
+    G, g, ID, Io, a, at, where, tried = room
     for s in range(sets):
         f = faults[s]
         base = 0.0
@@ -47,32 +54,45 @@ def nearest_points(I, Iz, faults, offset, direction, low, high, value, m):  # no
 @compiled(void(M3, M, *SETS, M, M3))
 def nearest(I, Iz, faults, offset, direction, low, high, value, m):  # noqa: E741
     """value (n, sets) and m (n, sets, f) of `nearest_points` for I (n or 1, p, p) and Iz (n, p)."""
+    work = room(direction.shape[1], direction.shape[2])
     for e in range(len(Iz)):
-        nearest_points(I[e % len(I)], Iz[e], faults, offset, direction, low, high, value[e], m[e])
+        nearest_points(I[e % len(I)], Iz[e], faults, offset, direction, low, high, value[e], m[e], work)
+
+
+@helper
+def invert(P, excess, a, I):  # noqa: E741
+    """I = (P + excess)^-1; a is room to work in."""
+    for i in range(len(P)):
+        for j in range(len(P)):
+            a[i, j] = P[i, j] + excess[i, j]
+            I[i, j] = 1.0 if i == j else 0.0
+    eliminate(a, I)
+
+
+@helper
+def informative(I, z, Iz):  # noqa: E741
+    """Iz = I z, and z' I z."""
+    healthy = 0.0
+    for i in range(len(z)):
+        Iz[i] = 0.0
+        for j in range(len(z)):
+            Iz[i] += I[i, j] * z[j]
+        healthy += z[i] * Iz[i]
+    return healthy
 
 
 @compiled(void(M, M3, M, *SETS, M, M3))
 def distances(z, P, excess, faults, offset, direction, low, high, J, m):
     """J (n, 1 + sets): squared distances of z (n, p) to healthy and each set in the metric of P (n or 1, p, p) + excess."""
     n, p = z.shape
-    a, I, Iz = np.empty((p, p)), np.empty((p, p)), np.empty(p)  # noqa: E741
+    a, I, Iz, work = np.empty((p, p)), np.empty((p, p)), np.empty(p), room(p, direction.shape[2])  # noqa: E741
     for e in range(n):
         if e < len(P):
-            for i in range(p):
-                for j in range(p):
-                    a[i, j] = P[e, i, j] + excess[i, j]
-                    I[i, j] = 1.0 if i == j else 0.0
-            eliminate(a, I)
-        healthy = 0.0
-        for i in range(p):
-            Iz[i] = 0.0
-            for j in range(p):
-                Iz[i] += I[i, j] * z[e, j]
-            healthy += z[e, i] * Iz[i]
-        J[e, 0] = healthy
-        nearest_points(I, Iz, faults, offset, direction, low, high, J[e, 1:], m[e])
+            invert(P[e], excess, a, I)
+        J[e, 0] = informative(I, z[e], Iz)
+        nearest_points(I, Iz, faults, offset, direction, low, high, J[e, 1:], m[e], work)
         for s in range(len(faults)):
-            J[e, 1 + s] += healthy
+            J[e, 1 + s] += J[e, 0]
 
 
 @helper
@@ -100,24 +120,52 @@ def gain(cost, penalty):
     return share
 
 
-@compiled(void(M, V, V, float64, I1, int64, B1, I1, I1, I1, I1, I1, int64, int64, int64, boolean, I1, I1, I1, I1, I1, B1))
-def declare(
-    cost, penalty, statistic, limit, k, warmup, informed, label, over, other, under, last, rise, switch, release, same,
-    label1, over1, other1, under1, last1, alarm,
-):  # fmt: skip
-    """The automata one sample later, and whether they alarm, from the costs (n, labels) and what each label must gain.
+@helper
+def declared(cost, penalty, statistic, limit, after, state, state1):
+    """An automaton, the five integers of `automaton.advance`, one sample later, as of `declare`; statistic (1,) or (0,)."""
+    rise, switch, release, same = after[0], after[1], after[2], after[3] > 0
+    if same:  # health is a label like the others
+        best = lowest(cost, penalty, 0)
+        above, below = best > 0, False
+    else:
+        best, share = lowest(cost, penalty, 1), gain(cost, penalty)
+        above, below = statistic[0] > limit if statistic.size else share > 1.0, share < 0.5
+    label, over, other, under, last = state[0], state[1], state[2], state[3], state[4]
+    new = advance(label, over, other, under, last, best, above, below, rise, switch, release, same)
+    state1[0], state1[1], state1[2], state1[3], state1[4] = new
 
-    The statistic (n,), where there is one, takes the place of the costs in raising an alarm.
+
+@compiled(void(M, V, V, float64, I1, I1, B1, I2, I2, I1, B1))
+def declare(cost, penalty, statistic, limit, after, k, informed, state, state1, label, alarm):
+    """The automata (n, 5) one sample later, and what they declare, from the costs (n, labels) and what each label must gain.
+
+    The statistic (n,), where there is one (else (0,)), takes the place of the costs in raising an alarm. after: rise,
+    switch, release, same and warmup of a persistence.
     """
     for e in range(len(cost)):
-        state = label[e], over[e], other[e], under[e], last[e]
-        if informed[e] and k[e] > warmup:
-            if same:  # health is a label like the others
-                best = lowest(cost[e], penalty, 0)
-                above, below = best > 0, False
-            else:
-                best, share = lowest(cost[e], penalty, 1), gain(cost[e], penalty)
-                above, below = statistic[e] > limit if statistic.size else share > 1.0, share < 0.5
-            state = advance(*state, best, above, below, rise, switch, release, same)
-        label1[e], over1[e], other1[e], under1[e], last1[e] = state
-        alarm[e] = state[0] > 0
+        state1[e] = state[e]
+        if informed[e] and k[e] > after[4]:
+            declared(cost[e], penalty, statistic[e : e + 1], limit, after, state[e], state1[e])
+        label[e], alarm[e] = state1[e, 0], state1[e, 0] > 0
+
+
+@compiled(void(M, M3, M, I1, *SETS, V, V, float64, I1, I1, B1, I2, I2, I1, B1, M, M3))
+def judge(
+    z, P, excess, labels, faults, offset, direction, low, high,
+    penalty, statistic, limit, after, k, informed, state, state1, label, alarm, cost, m,
+):  # fmt: skip
+    """`distances` as the costs of `declare`: of health, and of set s at labels[s]."""
+    n, p = z.shape
+    a, I, Iz, work = np.empty((p, p)), np.empty((p, p)), np.empty(p), room(p, direction.shape[2])  # noqa: E741
+    J = np.empty(len(faults))
+    for e in range(n):
+        if e < len(P):
+            invert(P[e], excess, a, I)
+        cost[e, 0] = informative(I, z[e], Iz)
+        nearest_points(I, Iz, faults, offset, direction, low, high, J, m[e], work)
+        for s in range(len(faults)):
+            cost[e, labels[s]] = J[s] + cost[e, 0]
+        state1[e] = state[e]
+        if informed[e] and k[e] > after[4]:
+            declared(cost[e], penalty, statistic[e : e + 1], limit, after, state[e], state1[e])
+        label[e], alarm[e] = state1[e, 0], state1[e, 0] > 0

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, NotApplicableError, Plant
 
 
@@ -21,6 +22,16 @@ class LinearModel(NamedTuple):
     def E(self, u: Array) -> Array:
         """dx+/dtheta under the command u (n, n_u): (n, n_x, n_theta)."""
         return self.E0 + (u @ self.Eu.reshape(len(self.Eu), -1)).reshape(-1, *self.E0.shape)
+
+    @property
+    def equations(self) -> tuple[Array, Array, Array, Array]:
+        """A, B, E0 and Eu, as a kernel takes them."""
+        return self.A, self.B, self.E0, self.Eu
+
+
+def stacked(Q: Array) -> Array:
+    """A covariance (N, N) for all episodes, or one for each (n, N, N), as a kernel takes it: (1 or n, N, N)."""
+    return contiguous(Q if Q.ndim == 3 else Q[None])
 
 
 def linear_model(plant: Plant) -> LinearModel:
@@ -44,7 +55,7 @@ def linear_model(plant: Plant) -> LinearModel:
 
     E0 = E(zero_u)
     Eu = np.stack([E(np.eye(n_u)[i : i + 1]) - E0 for i in range(n_u)])
-    return LinearModel(A, B, C, E0, Eu)
+    return LinearModel(*(contiguous(a) for a in (A, B, C, E0, Eu)))
 
 
 def linear_output(plant: Plant, sensors: Array | None = None) -> Array:
