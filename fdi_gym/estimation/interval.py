@@ -41,9 +41,9 @@ class Interval(NamedTuple):
         if self.Q_held is None:
             return Q
         n, n_x, _ = self.Q_held.shape
-        wanted, lines = (n if rows is None else rows), (len(Q) if Q.ndim == 3 else 1)
-        found = np.tile(Q if Q.ndim == 3 else Q[None], (wanted // lines, 1, 1))
-        found[:, :n_x, :n_x] += np.repeat(self.Q_held, wanted // n, axis=0)
+        wide = n if rows is None else rows
+        found = np.tile(Q if Q.ndim == 3 else Q[None], (wide // (len(Q) if Q.ndim == 3 else 1), 1, 1))
+        found[:, :n_x, :n_x] += np.repeat(self.Q_held, wide // n, axis=0)
         return found
 
 
