@@ -1,5 +1,6 @@
 """Scores, on episodes small enough to be read."""
 
+import msgspec
 import numpy as np
 import pytest
 from conftest import build
@@ -7,8 +8,8 @@ from conftest import build
 from fdi_gym.diagnosis import Decisions
 from fdi_gym.engine import Record
 from fdi_gym.faults import Scoring
-from fdi_gym.intervals import strata
-from fdi_gym.metrics import outcome, scored_samples
+from fdi_gym.intervals import strata, within
+from fdi_gym.metrics import Declaration, Onset, check_outcomes, outcome, scored_samples
 from fdi_gym.scores import balanced_accuracy, delay_quartiles, macro_f1, restricted_mean, summarise, survival
 
 LETTERS = {".": 0, "A": 1, "S": 2, "R": 3, "?": -1}
@@ -254,6 +255,38 @@ def test_strata_are_the_rarest_labels_and_none_has_one_flight():
     assert strata([[0], [0], [1, 2], [1], [1], [1]]).tolist() == [0, 0, 1, 1, 1, 1]
     assert strata([[0], [1], [2]]).tolist() == [-1, -1, -1]
     assert strata([[], [0], [0]]).tolist() == [0, 0, 0]
+
+
+def test_the_variance_of_a_sum_over_flights_is_what_drawing_flights_anew_within_strata_gives():
+    rng = np.random.default_rng(5)
+    stratum = np.repeat([0, 1, 2], [30, 50, 1])
+    values = rng.normal(3.0 + 10.0 * stratum[:, None], [[1.0, 4.0]], (81, 2))
+    sums = [
+        sum(rng.choice(values[stratum == s], (stratum == s).sum()).sum(axis=0) for s in range(3)) for _ in range(4000)
+    ]  # fmt: skip
+    assert within(values, stratum) == pytest.approx(np.var(sums, axis=0), rel=0.12)
+    assert within(values, stratum)[0] == pytest.approx(
+        sum((stratum == s).sum() * values[stratum == s, 0].var(ddof=1) for s in range(2))
+    )
+
+
+GOOD = episode(truth="..AAAA", said="...AAA", estimate=np.zeros((6, 4)), std=np.ones((6, 4)), probs=np.full((6, 5), 0.2))
+LATE = Onset(label=1, length=4, fresh=True, alarmed=False, labelled=False, detection=5, isolation=2)
+KNOWN = Onset(label=1, length=4, fresh=True, alarmed=True, labelled=False, detection=1, isolation=2)
+
+
+@pytest.mark.parametrize(("field", "value"), [
+    ("confusion", [(0, 7, 1)]), ("confusion", [(0, 0, 9)]), ("banded", [(1, 0)]), ("banded", [(0, 0), (1, 2), (0, 0)]),
+    ("alarmed", [(1, 1)]), ("alarmed", [(1, 1)] * 3), ("alarmed", [(1, 2), (0, 0)]), ("error_steps", [0, 0]),
+    ("error_steps", [9, 0, 0]), ("squared_error", [[0.0] * 3] * 3), ("squared_error", [[-1.0] + [0.0] * 3] * 3),
+    ("squared_fault", [0.0] * 3), ("squared_fault", [np.nan] * 4), ("stated", []), ("onsets", [LATE]), ("onsets", [KNOWN]),
+    ("healthy_steps", 9), ("alarm_steps", 9), ("false_alarms", 9), ("log_score", 1.0), ("log_score", -np.inf),
+    ("declaration", Declaration(0, False, 0.5, [])), ("declaration", Declaration(2, True, 1.0, [])),
+])  # fmt: skip
+def test_outcomes_that_no_flight_has_are_refused(field, value):
+    check_outcomes([GOOD], 5, 4)
+    with pytest.raises(ValueError, match="episode 0 has"):
+        check_outcomes([msgspec.structs.replace(GOOD, **{field: value})], 5, 4)
 
 
 def test_intervals_repeat_and_have_the_width_of_their_labels():
