@@ -13,7 +13,7 @@ from fdi_gym.plant import Array, Plant
 @diagnoser("null", "Always healthy")
 def null(plant: Plant) -> Diagnoser:
     """Says that there is no fault, whatever it sees."""
-    theta = plant.estimate_target(plant.nominal_theta, plant.trim_command)
+    theta = plant.healthy
 
     def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
         n = len(obs)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.special
 
-from fdi_gym.intervals import CONFIDENCE, resamples
+from fdi_gym.intervals import CONFIDENCE, recalls, resamples
 from fdi_gym.metrics import Outcome
 from fdi_gym.plant import Array
 from fdi_gym.scores import answers, strata_of
@@ -69,8 +69,7 @@ def draw_again(found: Mapping[str, Sequence[Outcome]], labels: int, kind: str = 
         hits, counts = np.diagonal(matrix[..., :-1], axis1=1, axis2=2), matrix.sum(axis=2)
         kept = counts.sum(axis=0) > 0
         hits, counts = hits[:, kept], counts[:, kept]
-        share = hits.sum(axis=0) / counts.sum(axis=0)
-        total = weights @ counts
+        share, total = recalls(hits, counts), weights @ counts
         # a label that a resample lacks stays as it is: it is never dropped
         recall = np.where(total > 0, (weights @ hits) / np.maximum(total, 1), share)
         score.append(share.mean() if kept.any() else 0.0)

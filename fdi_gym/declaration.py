@@ -6,7 +6,6 @@ truth, `declared` of what any diagnoser said over the flight, `errors` compares 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -30,6 +29,7 @@ class Errors(NamedTuple):
     onset: Array  # (n, modes) declared less true onset, in samples
     overlap: Array  # (n, modes) intersection over union of the declared and the true window
     size: Array  # (n, modes) declared less true size
+    worth: Array  # (n,) what the declarations are worth, 0 to 1; see `worth`
 
 
 def spans(plant: Plant) -> Array:
@@ -37,15 +37,17 @@ def spans(plant: Plant) -> Array:
     return np.array([mode.reach[1] - mode.reach[0] for mode in plant.modes])
 
 
-def sizes(plant: Plant, active: Sequence[int], deviation: Array) -> Array:
-    """The magnitude of each of the active modes (..., f) from the estimated quantity's deviation from healthy (..., n).
+def runs(label: Array, first: int = 0, last: int | None = None) -> list[tuple[int, int, int]]:
+    """Maximal runs of equal labels on the samples first..last: (first sample, sample after the last, label)."""
+    last = len(label) - 1 if last is None else last
+    edges = np.flatnonzero(np.diff(label[first : last + 1])) + first + 1
+    starts, stops = [first, *edges.tolist()], [*edges.tolist(), last + 1]
+    return [(a, b, int(label[a])) for a, b in zip(starts, stops, strict=True) if b > a]
 
-    Where the lines of the modes share a direction, the least magnitudes that explain it.
-    """
-    offset = np.sum([plant.modes[i].offset for i in active], axis=0)
-    D = np.transpose([plant.modes[i].direction for i in active])
-    low, high = np.transpose([plant.modes[i].reach for i in active])
-    return np.clip((deviation - offset) @ np.linalg.pinv(D).T, low, high)
+
+def stretches(mask: Array) -> list[tuple[int, int]]:
+    """The runs of True of a mask (K,): (first sample, sample after the last)."""
+    return [(a, b) for a, b, there in runs(mask) if there]
 
 
 def _settled(values: Array) -> float:
@@ -55,38 +57,20 @@ def _settled(values: Array) -> float:
     return float(np.median(values)) if values.size else np.nan
 
 
-def _deviation(plant: Plant, estimate: Array) -> Array:
-    return estimate - plant.estimate_target(plant.nominal_theta, plant.trim_command)
+Windows = dict[int, list[tuple[int, int]]]  # of each mode: (first sample, sample after the last)
 
 
-def _windows_to_rows(
-    plant: Plant, windows: dict[int, list[tuple[int, int]]], label: Array, deviation: Array | None
-) -> Array:
-    """The rows (modes, 4) of one flight from the windows (first sample, sample after the last) of each mode."""
+def _windows_to_rows(plant: Plant, windows: Windows, label: Array, estimate: Array | None) -> Array:
+    """The rows (modes, 4) of one flight from the windows of each mode, and the estimated quantity (K + 1, n) within them."""
     rows = np.zeros((len(plant.modes), COLUMNS))
-    position = {mode.name: i for i, mode in enumerate(plant.modes)}
+    reach = np.array([mode.reach for mode in plant.modes], float)
+    size = np.full((len(label), len(rows)), np.nan)
+    if estimate is not None:
+        size = np.clip(plant.magnitudes(label, estimate - plant.healthy), reach[:, 0], reach[:, 1])
     for i, found in windows.items():
-        magnitude = np.full(len(label), np.nan)
-        if deviation is not None:
-            for index, said in enumerate(plant.labels):
-                if plant.modes[i].name in said.modes and (mine := label == index).any():
-                    active = sorted(position[name] for name in said.modes)
-                    magnitude[mine] = sizes(plant, active, deviation[mine])[:, active.index(i)]
-        inside = np.concatenate([magnitude[a:b] for a, b in found])
-        size = _settled(inside)
-        rows[i] = 1.0, max(found[0][0] - 1, 0), found[-1][1] - 1, np.mean(plant.modes[i].reach) if np.isnan(size) else size
+        settled = _settled(np.concatenate([size[a:b, i] for a, b in found]))
+        rows[i] = 1.0, max(found[0][0] - 1, 0), found[-1][1] - 1, np.mean(reach[i]) if np.isnan(settled) else settled
     return rows
-
-
-def _runs_of(label: Array, members: Sequence[Array]) -> dict[int, list[tuple[int, int]]]:
-    """For each mode, its windows of samples: the maximal runs of labels that contain it."""
-    windows: dict[int, list[tuple[int, int]]] = {}
-    for i, labels in enumerate(members):
-        acting = np.concatenate([[0], np.isin(label, labels).astype(np.int8), [0]])
-        edges = np.flatnonzero(np.diff(acting))
-        if edges.size:
-            windows[i] = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-    return windows
 
 
 def _members(plant: Plant) -> list[Array]:
@@ -96,7 +80,8 @@ def _members(plant: Plant) -> list[Array]:
 
 def true_rows(plant: Plant, label: Array, target: Array) -> Array:
     """What was true of one flight (modes, 4), from its labels (K + 1,) and estimated quantity (K + 1, n)."""
-    return _windows_to_rows(plant, _runs_of(label, _members(plant)), label, _deviation(plant, target))
+    found = {i: stretches(np.isin(label, labels)) for i, labels in enumerate(_members(plant))}
+    return _windows_to_rows(plant, {i: windows for i, windows in found.items() if windows}, label, target)
 
 
 def true_declaration(plant: Plant, record: Record) -> Array:
@@ -111,9 +96,8 @@ def true_declaration(plant: Plant, record: Record) -> Array:
 
 def alarms(label: Array) -> list[tuple[int, int]]:
     """The alarms of a flight (first sample, sample after the last), gaps bridged and short ones left out."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], (label > 0).astype(np.int8), [0]]))).reshape(-1, 2).tolist()
     joined: list[tuple[int, int]] = []
-    for first, last in edges:
+    for first, last in stretches(label > 0):
         if joined and first - joined[-1][1] <= BRIDGED:
             joined[-1] = joined[-1][0], last
         else:
@@ -123,7 +107,7 @@ def alarms(label: Array) -> list[tuple[int, int]]:
 
 def declared_rows(plant: Plant, label: Array, estimate: Array | None) -> Array:
     """What a diagnoser's labels (K + 1,) and estimates (K + 1, n) over one flight amount to (modes, 4); see `declared`."""
-    windows: dict[int, list[tuple[int, int]]] = {}
+    windows: Windows = {}
     members = _members(plant)
     for first, after in alarms(label):
         enough = min(SHARE * (after - first), max(SHORTEST, LASTING * len(label)))
@@ -135,7 +119,7 @@ def declared_rows(plant: Plant, label: Array, estimate: Array | None) -> Array:
         earliest = min((begin for begin, _ in named.values()), default=first)
         for i, (begin, end) in named.items():
             windows.setdefault(i, []).append((first if begin == earliest else begin, end))
-    return _windows_to_rows(plant, windows, label, None if estimate is None else _deviation(plant, estimate))
+    return _windows_to_rows(plant, windows, label, estimate)
 
 
 def declared(plant: Plant, said: Decisions, length: Array) -> Array:
@@ -164,13 +148,17 @@ def errors(plant: Plant, truth: Array, declaration: Array) -> Errors:
     a, b = truth[..., ONSET : END + 1], declaration[..., ONSET : END + 1]
     common = np.maximum(np.minimum(a[..., 1], b[..., 1]) - np.maximum(a[..., 0], b[..., 0]), 0.0)
     union = (a[..., 1] - a[..., 0]) + np.maximum(b[..., 1] - b[..., 0], 0.0) - common
-    overlap = common / np.maximum(union, 1.0)
-    return Errors(
+    exact, overlap, error = (
         (is_there == is_said).all(axis=-1),
-        np.where(both, b[..., 0] - a[..., 0], np.nan),
-        np.where(both, overlap, np.nan),
+        np.where(both, common / np.maximum(union, 1.0), np.nan),
         np.where(both, declaration[..., SIZE] - truth[..., SIZE], np.nan),
     )
+    span = spans(plant)
+    right = np.maximum(1.0 - np.abs(error) / np.where(span > 0, span, 1.0), 0.0)
+    parts = np.stack([np.ones_like(right), overlap, right]).mean(axis=0)
+    mean = np.where(is_there, np.nan_to_num(parts), 0.0).sum(axis=-1) / np.maximum(is_there.sum(axis=-1), 1)
+    value = np.where(exact, np.where(is_there.any(axis=-1), mean, 1.0), 0.0)
+    return Errors(exact, np.where(both, b[..., 0] - a[..., 0], np.nan), overlap, error, value)
 
 
 def worth(plant: Plant, truth: Array, declaration: Array) -> Array:
@@ -179,10 +167,4 @@ def worth(plant: Plant, truth: Array, declaration: Array) -> Array:
     Else the mean of 1, the overlap of the windows, and 1 less the error of the size as a share of its mode's reach (not
     below 0), over the modes.
     """
-    found = errors(plant, truth, declaration)
-    span = spans(plant)
-    size = np.maximum(1.0 - np.abs(found.size) / np.where(span > 0, span, 1.0), 0.0)
-    parts = np.stack([np.ones_like(size), found.overlap, size]).mean(axis=0)
-    there = truth[..., PRESENT] >= 0.5
-    mean = np.where(there, np.nan_to_num(parts), 0.0).sum(axis=-1) / np.maximum(there.sum(axis=-1), 1)
-    return np.where(found.exact, np.where(there.any(axis=-1), mean, 1.0), 0.0)
+    return errors(plant, truth, declaration).worth

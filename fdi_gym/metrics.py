@@ -15,7 +15,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from fdi_gym.declaration import PRESENT, declared_rows, errors, spans, true_rows, worth
+from fdi_gym.declaration import PRESENT, declared_rows, errors, runs, spans, true_rows
 from fdi_gym.diagnosis import Decisions
 from fdi_gym.engine import Record
 from fdi_gym.faults import Scoring
@@ -164,13 +164,6 @@ def scored_samples(label: Array, length: int, scoring: Scoring) -> Array:
     return mask
 
 
-def runs(label: Array, first: int, last: int) -> list[tuple[int, int, int]]:
-    """Maximal runs of equal labels on the samples first..last: (first sample, sample after the last, label)."""
-    edges = np.flatnonzero(np.diff(label[first : last + 1])) + first + 1
-    starts, stops = [first, *edges.tolist()], [*edges.tolist(), last + 1]
-    return [(a, b, int(label[a])) for a, b in zip(starts, stops, strict=True) if b > a]
-
-
 def severity_bands(plant: Plant, label: Array, theta: Array) -> Array:
     """Band index (K + 1,) of each sample by the size of its smallest active fault; -1 where healthy."""
     band = np.full(len(label), -1)
@@ -230,7 +223,7 @@ def _declaration(plant: Plant, label: Array, target: Array, said: Array, estimat
     wrong, span = errors(plant, truth, declared), spans(plant)
     both = np.flatnonzero(np.isfinite(wrong.onset[0]))
     return Declaration(
-        int(truth[0, :, PRESENT].sum()), bool(wrong.exact[0]), float(worth(plant, truth, declared)[0]),
+        int(truth[0, :, PRESENT].sum()), bool(wrong.exact[0]), float(wrong.worth[0]),
         [Found(int(wrong.onset[0, i]), float(wrong.overlap[0, i]), float(wrong.size[0, i] / span[i] if span[i] else 0.0))
          for i in both],
     )  # fmt: skip
@@ -259,8 +252,7 @@ def outcome(plant: Plant, scoring: Scoring, record: Record, said: Decisions, i: 
         for p in range(len(PHASES)):
             squares[p] = [float(v) for v in error[phase == p].sum(axis=0)]
             steps[p] = int((phase == p).sum())
-        nominal = plant.estimate_target(plant.nominal_theta, plant.trim_command)
-        moved = [float(v) for v in ((record.target[i] - nominal)[phase == 1] ** 2).sum(axis=0)]
+        moved = [float(v) for v in ((record.target[i] - plant.healthy)[phase == 1] ** 2).sum(axis=0)]
         if said.estimate_std is not None:
             stated = _stated(error, said.estimate_std[i], phase == 1)
     flight = slice(length + 1)

@@ -197,6 +197,32 @@ class Plant(Truth):
         return theta if self.target is None else self.target(theta, u)
 
     @functools.cached_property
+    def healthy(self) -> Array:
+        """The estimated quantity (n,) of the plant without a fault."""
+        return self.estimate_target(self.nominal_theta, self.trim_command)
+
+    def magnitudes(self, label: Array, deviation: Array) -> Array:
+        """How far along its line each mode of a label is (..., modes); NaN where the label does not have it.
+
+        Where the lines of a label's modes share a direction, the least magnitudes that explain the deviation.
+
+        Args:
+            label: Label indices (...); others than the plant's have no modes.
+            deviation: Of the estimated quantity from healthy (..., n).
+        """
+        found = np.full((*label.shape, len(self.modes)), np.nan)
+        for index, of in enumerate(self.labels):
+            active = [i for i, mode in enumerate(self.modes) if mode.name in of.modes]
+            mine = label == index
+            if active and mine.any():
+                offset = np.sum([self.modes[i].offset for i in active], axis=0)
+                D = np.transpose([self.modes[i].direction for i in active])
+                values = (deviation[mine] - offset) @ np.linalg.pinv(D).T
+                for column, i in enumerate(active):
+                    found[mine, i] = values[:, column]
+        return found
+
+    @functools.cached_property
     def theta_entries(self) -> tuple[str, ...]:
         """Names of the entries of theta, in order."""
         return tuple(s.name for s in self.theta)

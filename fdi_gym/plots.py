@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_gym.declaration import END, ONSET, PRESENT, true_declaration
+from fdi_gym.declaration import END, ONSET, PRESENT, stretches, true_declaration
 from fdi_gym.engine import Record
 from fdi_gym.plant import Array, Plant
 
@@ -119,17 +119,11 @@ class Canvas:
             self._show.close(self.figure)
 
 
-def _spans(mask: Array) -> list[tuple[int, int]]:
-    """(first, stop) of the runs of True. Sample k closes the interval from k - 1."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
-    return [(max(int(a) - 1, 0), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
 def _dress(axis: Any, label: Array, dt: float) -> None:
     """No box, and a shade where a fault acts."""
     axis.spines[["top", "right"]].set_visible(False)
-    for first, stop in _spans(label > 0):
-        axis.axvspan(first * dt, stop * dt, color=SHADE, lw=0, zorder=0)
+    for first, stop in stretches(label > 0):  # sample k closes the interval from k - 1
+        axis.axvspan(max(first - 1, 0) * dt, (stop - 1) * dt, color=SHADE, lw=0, zorder=0)
 
 
 def flight(plant: Plant, record: Record, said: dict[str, Any], i: int = 0, entries: Sequence[int] | None = None) -> Any:

@@ -174,7 +174,7 @@ def test_model_is_the_flight_without_noise(plant_id):
     model = model_of(plant)
     scenarios = [draw(plant.process("standard"), VALIDATION_SEED + 900_000 + i).replace(physical={}) for i in range(8)]
     record = simulate(plant, scenarios)
-    healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
+    healthy = plant.healthy
     ends = [(0, 2, *np.flatnonzero(record.label[i])[:2], record.length[i] - 1) for i in range(8)]
     seen = 0
     for i, end in enumerate(ends):

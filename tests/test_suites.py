@@ -25,9 +25,7 @@ def record_of(plant, scenarios):
     for row, scenario in zip(label, scenarios, strict=True):
         row[: scenario.steps + 1] = plant.label_rows(scenario)
     theta = np.broadcast_to(plant.nominal_theta, (*label.shape, len(plant.nominal_theta)))
-    target = np.broadcast_to(
-        plant.estimate_target(plant.nominal_theta, plant.trim_command), (*label.shape, len(plant.estimated))
-    )
+    target = np.broadcast_to(plant.healthy, (*label.shape, len(plant.estimated)))
     obs = np.zeros((*label.shape, 1))
     return Record(obs, obs, theta, target, label, np.array([s.steps for s in scenarios]), np.zeros(len(label), bool))
 

@@ -86,7 +86,7 @@ def _windowed(
     depth = 1 if length is None else (length - 1) * stride + 1
     nominal, scale = (np.array([getattr(s, name) for s in plant.observed]) for name in ("nominal", "scale"))
     low, high = (np.array([getattr(s, name) for s in plant.estimated]) for name in ("low", "high"))
-    healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
+    healthy = plant.healthy
 
     def init(n: int) -> Any:
         label, probs, estimate = (

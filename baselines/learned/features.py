@@ -66,7 +66,7 @@ def scaled(plant: Plant, obs: Array) -> Array:
 
 def deviation(plant: Plant, target: Array) -> Array:
     """The estimated quantity (..., n_estimated) as (value - healthy) / scale."""
-    healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
+    healthy = plant.healthy
     return (target - healthy) / np.array([s.scale for s in plant.estimated])
 
 

@@ -45,7 +45,7 @@ def policy_diagnoser(plant: Plant, shape: FeatureShape, tensors: Mapping[str, Ar
     layers = {name: value.astype(float) for name, value in tensors.items() if name.startswith("layers.")}
     labels, isolates = len(plant.labels), task == "isolation"
     low, high = (np.array([getattr(s, bound) for s in plant.estimated]) for bound in ("low", "high"))
-    healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
+    healthy = plant.healthy
 
     def init(n: int) -> Any:
         none = np.zeros(n, np.int64)

@@ -62,7 +62,7 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
     context = np.eye(len(card.processes))[card.processes.index(expected)]
     calibration = weights.calibration_of(file, card, expected)
     scale, bias, prior = calibration.scale, np.array(calibration.bias), np.array(calibration.prior)
-    healthy = plant.estimate_target(plant.nominal_theta, plant.trim_command)
+    healthy = plant.healthy
     unit = np.array([s.scale for s in plant.estimated])
 
     def init(n: int) -> Any:

@@ -122,7 +122,7 @@ def shell(plant: Plant, filter: Filter, rule: Rule) -> tuple[Callable[[int], Run
 def diagnoser_of(plant: Plant, filter: Filter, rule: Rule) -> Diagnoser:
     """The diagnoser that declares what a rule makes of a filter's readings."""
     start, step = shell(plant, filter, rule)
-    healthy = contiguous(plant.estimate_target(plant.nominal_theta, plant.trim_command))
+    healthy = contiguous(plant.healthy)
 
     def update(s: Running, obs: Array) -> tuple[Running, Diagnosis]:
         s, r, verdict = step(s, obs)

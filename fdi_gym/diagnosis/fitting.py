@@ -74,17 +74,7 @@ def _model_error(plant: Plant, scenarios: list[FaultScenario], record: Record, v
 
 def _magnitudes(plant: Plant, z: Array, record: Record, block: int) -> tuple[Array, Array, Array]:
     """Mean, standard deviation and walk of each mode's magnitude, over the samples where it acts (modes,)."""
-    count = len(plant.modes)
-    m = np.full((*z.shape[:2], count), np.nan)
-    for index, label in enumerate(plant.labels):
-        active = [i for i, mode in enumerate(plant.modes) if mode.name in label.modes]
-        if active:
-            mine = record.label == index
-            offset = np.sum([plant.modes[i].offset for i in active], axis=0)
-            D = np.transpose([plant.modes[i].direction for i in active])
-            values = (z[mine] - offset) @ np.linalg.pinv(D).T
-            for column, i in enumerate(active):
-                m[mine, i] = values[:, column]
+    count, m = len(plant.modes), plant.magnitudes(record.label, z)
     mean, std, walk = np.zeros(count), np.zeros(count), np.zeros(count)
     for i, mode in enumerate(plant.modes):
         low, high = mode.reach
@@ -124,7 +114,7 @@ def fit_belief(plant: Plant, process: str) -> Belief:
     R = (plant.R + long_run(dy, valid, block))[np.ix_(sensors, sensors)]
     P0 = np.diag((START * scale) ** 2 + ((record.state[:, 0] - plant.trim_state) ** 2).mean(axis=0))
 
-    z = faulty.target - plant.estimate_target(plant.nominal_theta, plant.trim_command)
+    z = faulty.target - plant.healthy
     z = np.where((faulty.label > 0)[..., None], z, 0.0)[..., inputs.estimated]
     seen = [np.abs(z[..., j][z[..., j] != 0]) for j in range(z.shape[-1])]
     size = np.array([

@@ -83,7 +83,7 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
     def init(n: int) -> Any:
         if n < 0 or isinstance(n, bool):
             raise ValueError(f"the number of episodes is at least 0, not {n}")
-        estimate = np.tile(plant.estimate_target(plant.nominal_theta, plant.trim_command), (n, 1))
+        estimate = np.tile(plant.healthy, (n, 1))
         healthy = Diagnosis(np.zeros(n, bool), np.zeros(n, np.int64), estimate, np.full_like(estimate, np.nan))
         return raw.init(n) if n else None, healthy, np.zeros((n, width)), np.zeros(n, bool)
 
