@@ -1,0 +1,74 @@
+"""What methods know: fit, train."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from fdi_gym.commands.arguments import Names
+
+
+def fit(
+    plant: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PLANT")],
+    diagnosers: Names = ("all",),
+    jobs: int = -1,
+    output: Path | None = None,
+) -> None:
+    """Fit what methods know of a plant, for all suites of it that are here: beliefs, and calibrations on healthy flights.
+
+    Args:
+        plant: Plant or environment id; "module:id" where the module registers it.
+        diagnosers: Names; "all" for every one that takes any.
+        jobs: Worker processes, -1 for one per core.
+        output: Folder that gets PLANT.json. Default: `fits` in the package of the methods, whence they are read.
+    """
+    from fdi_gym.diagnosis import diagnosers as known
+    from fdi_gym.diagnosis import find_diagnoser, knowledge
+    from fdi_gym.listing import find_plant
+    from fdi_gym.suite import load_suite, suite_names
+
+    plant_id = find_plant(plant)[1]
+    names = list(known()) if diagnosers == ("all",) else list(dict.fromkeys(diagnosers))
+    entries = [entry for entry in map(find_diagnoser, names) if entry.takes("belief") or entry.takes("calibration")]
+    suites = [suite for suite in map(load_suite, suite_names()) if suite.plant == plant_id]
+    if not entries or not suites:
+        raise ValueError(f"nothing to fit: {len(suites)} suites of {plant_id}, {len(entries)} methods that take a belief")
+    for path, found in knowledge.fit_suites(entries, suites, jobs).items():
+        place = path if output is None else output / path.name
+        knowledge.write_fits(place, found)
+        print(f"{len(found.beliefs)} beliefs and {len(found.calibrations)} calibrations in {place}")
+
+
+def train(
+    method: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="METHOD")],
+    plant: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PLANT")],
+    budget: int | None = None,
+    seed: int = 0,
+    work: Path = Path("runs"),
+    threads: int = 1,
+    output: Path | None = None,
+) -> None:
+    """Train a diagnoser; a run that was killed goes on from its checkpoint and ends with the same weights.
+
+    Args:
+        method: Name of a trainer, or "module:function".
+        plant: Plant or environment id; "module:id" where the module registers it.
+        budget: How much to train: flights per process, or for reinforcement learning agent steps. Default: the recipe's.
+        seed: Of the run.
+        work: Folder of runs: checkpoint, tensorboard log, weights and card.
+        threads: Of the library that trains.
+        output: Folder that gets a copy of weights and card.
+    """
+    from fdi_gym.diagnosis import train as run
+    from fdi_gym.discovery import load_plant
+    from fdi_gym.files import write_whole
+    from fdi_gym.listing import find_plant
+
+    path = run(method, load_plant(find_plant(plant)[1]), budget=budget, seed=seed, work=work, threads=threads)
+    for suffix in (".safetensors", ".json"):
+        if output is not None:
+            output.mkdir(parents=True, exist_ok=True)
+            write_whole(output / f"{path.stem}{suffix}", path.with_suffix(suffix).read_bytes())
+    print(path if output is None else output / path.name)
