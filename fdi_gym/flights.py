@@ -9,7 +9,7 @@ import numpy as np
 
 from fdi_gym import closed_loop
 from fdi_gym.closed_loop import FLYING, OVER, TERMINATED
-from fdi_gym.faults import Abrupt, FaultScenario, Hold, Incipient, Intermittent, Samples, Square
+from fdi_gym.faults import Abrupt, Effect, FaultScenario, Hold, Incipient, Intermittent, Ramp, Samples, Sampling, Square
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Plant
 from fdi_gym.truth import Inputs
@@ -41,7 +41,23 @@ def _signals(plant: Plant) -> tuple[Any, ...]:
     boxes = [np.array([[s.low for s in signals], [s.high for s in signals]], float).reshape(2, -1)
              for signals in (plant.outputs, plant.commands)]  # fmt: skip
     sigma = np.array([s.sigma for s in (*plant.outputs, *plant.states)])
-    return *boxes, sigma, plant.noise_limit, np.array([plant.reference_width, len(plant.disturbances)], np.int64)
+    widths = plant.reference_width, len(plant.disturbances), plant.own_theta, plant.healthy_feedback
+    return *boxes, sigma, plant.noise_limit, np.array(widths, np.int64)
+
+
+def effects_lag(plant: Plant, effect: Effect) -> int:
+    """By how many samples an effect makes a sensor lag, at most."""
+    if plant.bare is None or plant.theta_entries.index(effect.entry) not in plant.lags:
+        return 0
+    match effect:
+        case Samples(values=values):
+            return int(max(values))
+        case Square(value=value, other=other):
+            return int(max(value, other))
+        case Hold():
+            return 0
+        case _:
+            return int(effect.value)  # type: ignore[attr-defined]
 
 
 class Flights:
@@ -51,7 +67,7 @@ class Flights:
         plant: The plant; its physical parameters come from each scenario.
         scenarios: One per flight; they may differ in length.
         noise: (w (K, n_x), v (K + 1, n_y)) per flight. Default: by counter, from each scenario's noise seed.
-        longest_lag: Samples that a sensor fault may lag behind.
+        longest_lag: Samples that a sensor may lag behind by the table that `advance` takes; scenarios say it themselves.
 
     Attributes:
         k: (N,) the sample that each flight comes to next; the last one where it is over.
@@ -77,7 +93,8 @@ class Flights:
         self.seed, self.status = np.zeros(n, np.uint64), np.full(n, OVER, np.int64)
         self.x, self.c, self.u = np.zeros((n, n_x)), np.zeros((n, len(plant.c0))), np.zeros((n, n_u))
         self.theta, self.p = np.zeros((n, n_theta)), np.zeros((n, len(plant.nominal_p)))
-        self.readings, self.history = np.zeros((n, n_y)), np.zeros((n, longest_lag + 1 if longest_lag else 0, n_y))
+        self.readings, self.history = np.zeros((n, 2, n_y)), np.zeros((n, longest_lag + 1 if longest_lag else 0, n_y))
+        self.reporting, self.dropped = np.zeros((0, n_y, closed_loop.REPORTING)), np.zeros((0, n_y))
         self.effects, self.held = np.zeros((n, 1, closed_loop.COLUMNS)), np.zeros((n, 1))
         self.counts, self.labels = np.zeros(n, np.int64), np.full((n, 2, 2), NEVER)
         self.tables: list[tuple[Any, ...]] = [()] * n  # reference, disturbance, w, v and samples of effects: by address
@@ -133,6 +150,7 @@ class Flights:
             if scenario.x0 is not None:
                 self.x[i] = scenario.x0
             samples = self._set_effects(i, scenario)
+            self._set_sampling(i, scenario)
             self._set_labels(i, labels)
             self.tables[i] = (inputs.reference, inputs.disturbance, *given, samples)
             self._point(i)
@@ -161,6 +179,8 @@ class Flights:
                         what = (closed_loop.ABRUPT, value, 0, 0)
                     case Incipient(value=value, rate=rate):
                         what = (closed_loop.INCIPIENT, value, rate, 0)
+                    case Ramp(value=value, duration=duration):
+                        what = (closed_loop.RAMP, value, duration, 0)
                     case Intermittent(value=value, period=period, duty=duty):
                         what = (closed_loop.INTERMITTENT, value, period, duty)
                     case Square(value=value, other=other, period=period):
@@ -183,6 +203,35 @@ class Flights:
                     self.held[i, e] = plant.trim_command[row[5]]
         return samples
 
+    def _set_sampling(self, i: int, scenario: FaultScenario) -> None:
+        """How flight i's sensors report, and room for the past that the slowest of them shows."""
+        plant, said = self.plant, scenario.sampling
+        lags = [effects_lag(plant, effect) for fault in scenario.faults for effect in fault.effects]
+        longest = max(lags, default=0) + (max(said.delays.values(), default=0) if isinstance(said, Sampling) else 0)
+        if longest >= max(self.history.shape[1], 1):
+            self._remember(longest)
+        if len(self.reporting):
+            self.reporting[i], self.dropped[i] = 0.0, 0.0
+        if not isinstance(said, Sampling):
+            return
+        if not len(self.reporting):
+            self.reporting, self.dropped = (np.zeros((len(self), *a.shape[1:])) for a in (self.reporting, self.dropped))
+        rows, p = self.reporting[i], said.dropout
+        stay = p if said.burst == 1.0 else 1.0 - 1.0 / said.burst
+        rows[:, closed_loop.AGAIN] = said.hold
+        rows[:, closed_loop.BEGIN], rows[:, closed_loop.STAY] = (1.0 - stay) * p / (1.0 - p), stay
+        for column, by_name in ((closed_loop.PERIOD, said.periods), (closed_loop.DELAY, said.delays)):
+            for j, output in enumerate(plant.outputs):
+                rows[j, column] = by_name.get(output.name, 0)
+
+    def _remember(self, longest: int) -> None:
+        """A longer history; that of the flights under way is kept."""
+        before = self.history
+        self.history = np.zeros((before.shape[0], longest + 1, before.shape[2]))
+        for i, k in enumerate(self.k.tolist()):
+            past = np.arange(max(k - before.shape[1], 0), k)
+            self.history[i, past % (longest + 1)] = before[i, past % max(before.shape[1], 1)]
+
     def _set_labels(self, i: int, changes: list[tuple[int, int]]) -> None:
         if len(changes) >= self.labels.shape[1]:
             more = len(changes) + 1 - self.labels.shape[1]
@@ -201,7 +250,8 @@ class Flights:
         return (
             self.seed, self.length, *self.addresses, *self.steps,
             self.p, self.effects, self.counts, self.values, self.labels,
-            self.k, self.status, self.x, self.c, self.u, self.theta, self.held, self.readings, self.history,
+            self.reporting, self.k, self.status, self.x, self.c, self.u, self.theta, self.held, self.readings, self.history,
+            self.dropped,
         )  # fmt: skip
 
     def blank(self, samples: int) -> Chunk:

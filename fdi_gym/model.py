@@ -11,6 +11,8 @@ import numpy as np
 
 Array = np.ndarray
 
+SENSOR_FAULTS = ("gain", "bias", "noise", "frozen", "lag", "missing")  # columns of `fdi_gym.sensors`, in order
+
 
 def contiguous(a: Any) -> Array:
     """As the compiled kernels take an array: float64, in C order and writable; a copy only of one that is not."""
@@ -28,6 +30,7 @@ class Model:
     outputs: tuple[Any, ...]
     commands: tuple[Any, ...]
     theta: tuple[Any, ...]
+    bare: Any
     disturbances: tuple[Any, ...]
     physical: Callable[[Mapping[str, Any]], Array]
 
@@ -35,6 +38,18 @@ class Model:
     def nominal_theta(self) -> Array:
         """The healthy fault parameter (n_theta,)."""
         return np.array([s.nominal for s in self.theta])
+
+    @functools.cached_property
+    def own_theta(self) -> int:
+        """How many entries of theta the equations get; the others are faults of the sensors."""
+        return len(self.theta if self.bare is None else self.bare.theta)
+
+    @functools.cached_property
+    def lags(self) -> range:
+        """The positions in theta of the sensors' lags; none where sensors don't fail."""
+        column, n_y = SENSOR_FAULTS.index("lag"), len(self.outputs)
+        first = self.own_theta + column * n_y
+        return range(0) if self.bare is None else range(first, first + n_y)
 
     @functools.cached_property
     def nominal_p(self) -> Array:
@@ -79,7 +94,8 @@ class Model:
                 raise ValueError(f"{name} has {n} columns and rows that serve the {len(points)} points alike, not {a.shape}")
         if len(points) % times.size if times.size else len(points):
             raise ValueError(f"t is one number, or serves the {len(points)} points alike, not {times.size} numbers")
-        return times, *rows, np.empty((len(points), width))
+        own = contiguous(rows[2][:, : self.own_theta])
+        return times, *rows[:2], own, *rows[3:], np.empty((len(points), width))
 
     @functools.cached_property
     def _widths(self) -> tuple[int, ...]:
@@ -112,7 +128,12 @@ class Model:
         x = np.asarray(x, float)
         rows = self._rows_of(t, x, u, theta, d, p, len(self.outputs))
         integration.evaluate(self.addresses[1], *rows)
-        return rows[-1].reshape(*x.shape[:-1], len(self.outputs))
+        y, own, n_y = rows[-1], self.own_theta, len(self.outputs)
+        if theta is not None and own < len(self.theta):  # gains and biases of the sensors
+            wrong = self._rows(theta, self.nominal_theta)[:, own : own + 2 * n_y]
+            wrong = np.repeat(wrong, len(y) // max(len(wrong), 1), axis=0)
+            y += y * wrong[:, :n_y] + wrong[:, n_y:]
+        return y.reshape(*x.shape[:-1], n_y)
 
     def derivative(self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None) -> Array:
         """xdot at x (..., n_x); arguments as in `propagate`. For a discrete plant it is the next state."""

@@ -88,6 +88,9 @@ class Plant(Truth):
         c0: Initial state of the controller.
         q: Parameters of the controller.
         true_feedback: The controller gets the sensors' values before their noise is added; diagnosers never do.
+        healthy_feedback: The controller gets what healthy sensors would say, each at every sample.
+        bare: Of a plant whose sensors may fail (`fdi_gym.sensors`): the same without.
+        regular: Of a plant whose sensors leave samples out: the same with sensors that report at every one.
         physical: Maps a scenario's physical parameters to the vector p; of {} it gives the nominal model.
         perturb: Draws physical parameters at a level of mismatch: perturb(rng, level) -> dict, or None if it has none.
         reference: Maps a scenario to the exogenous reference rows (steps + 1, n_r). Of a row that stays the same,
@@ -128,6 +131,9 @@ class Plant(Truth):
     c0: Array = field(default_factory=lambda: np.zeros(0))
     q: Array = field(default_factory=lambda: np.zeros(0))
     true_feedback: bool = False
+    healthy_feedback: bool = False
+    bare: Plant | None = None
+    regular: Plant | None = None
     physical: Callable[[Mapping[str, Any]], Array] = _no_change
     perturb: Callable[[np.random.Generator, float], Mapping[str, Any]] | None = None
     reference: Callable[[FaultScenario], Array] = _no_rows

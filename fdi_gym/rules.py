@@ -94,6 +94,16 @@ def plain(value: Any) -> Any:
     return value
 
 
+class Readings(Box):
+    """Observations: numbers between bounds, or NaN where a sensor did not report."""
+
+    def contains(self, x: Any) -> bool:
+        """Whether x is one."""
+        if isinstance(x, np.ndarray) and x.shape == self.shape and np.isnan(x).any():
+            x = np.where(np.isnan(x), self.low, x)
+        return super().contains(x)
+
+
 class Specified:
     """An environment whose spec survives JSON, whatever it was made with."""
 
@@ -152,7 +162,7 @@ class Rules:
             high = np.nextafter(np.float32((high - self._nominal) / self._scale), np.float32(np.inf))
         if self.period > 1:
             low, high = np.tile(low, (self.period, 1)), np.tile(high, (self.period, 1))
-        self.observation_space = Box(low, high, dtype=dtype)
+        self.observation_space = Readings(low, high, dtype=dtype)
         self.action_space = self.task.space
 
     def _checked_mismatch(self, mismatch: Any) -> float | None:

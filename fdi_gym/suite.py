@@ -9,7 +9,7 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import msgspec
 import numpy as np
@@ -20,6 +20,7 @@ from fdi_gym.faults import MAX_STEPS, FaultScenario, draw
 from fdi_gym.files import RefusedError, digest, pretty, read_json, write_whole
 from fdi_gym.names import blame, check_diagnoser_name, check_name, find_function, find_module, unknown
 from fdi_gym.plant import Plant
+from fdi_gym.sensors import Options
 
 _PACKAGED = Path(__file__).parent / "suites"
 _CHECKOUT = Path(__file__).parent.parent / "leaderboards" / "suites"
@@ -56,12 +57,12 @@ def checked_options(plant_id: str, options: Mapping[str, Any], *, typed: bool = 
     if plant_id not in sources:
         raise unknown("plant", plant_id, sources)
     build = find_function("plant", sources[plant_id].builder)
-    signature = inspect.signature(build, eval_str=True).parameters
+    signature, every = inspect.signature(build, eval_str=True).parameters, get_type_hints(Options)
     found = {}
     for name, value in options.items():
-        if name not in signature:
-            raise unknown(f"option of {plant_id}", name, signature)
-        kind = signature[name].annotation
+        if name not in signature and name not in every:
+            raise unknown(f"option of {plant_id}", name, [*signature, *every])
+        kind = signature[name].annotation if name in signature else every[name]
         kind = type(signature[name].default) if kind is inspect.Parameter.empty else kind
         try:
             found[name] = msgspec.convert(value, kind, strict=typed)
