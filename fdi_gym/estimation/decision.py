@@ -27,7 +27,7 @@ from fdi_gym.estimation import label_kernels
 from fdi_gym.estimation.automaton import Automaton, first, step
 from fdi_gym.estimation.calibration import LEAST, Calibration, Persistence
 from fdi_gym.estimation.kalman import quadratic
-from fdi_gym.estimation.labels import manifolds
+from fdi_gym.estimation.labels import distances, manifolds
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, Plant
 
@@ -46,6 +46,7 @@ class Reading(NamedTuple):
     probs: Array | None = None  # (n, labels)
     signals: dict[str, Array] | None = None  # (n, ...) each
     span: Array | None = None  # (n,) samples over which z is the mean, where that is not 1
+    gain: Array | None = None  # (n, labels) by how much labels fit better than healthy for reasons that are no line
 
 
 class Evidence(NamedTuple):
@@ -204,6 +205,14 @@ def by_labels(
     def start(n: int) -> Any:
         return np.zeros((n, 5), np.int64), None  # the automata, and the statistic
 
+    def costs(r: Reading) -> tuple[Array, Array]:
+        assert r.z is not None
+        assert r.P is not None
+        J, at = distances(r.z, r.P if fixed is None else fixed, sets, excess)
+        cost = np.empty((len(r.z), labels))
+        cost[:, 0], cost[:, sets.labels] = J[:, 0], J[:, 1:]
+        return cost, at
+
     def step(state: Any, k: Array, r: Reading, informed: Array) -> tuple[Any, Verdict]:
         declared, tested = state
         n, rise = len(k), None
@@ -215,8 +224,9 @@ def by_labels(
             penalty, none if rise is None else rise, limit, lengths, k, informed, declared, following, label, alarm,
         )  # fmt: skip
         z = None
-        if r.cost is not None:
-            cost = contiguous(r.cost)
+        if r.cost is not None or r.gain is not None:
+            cost, at = (r.cost, None) if r.cost is not None else costs(r)
+            cost = contiguous(cost if r.gain is None else np.where(r.gain > 0, np.minimum(cost, cost[:, :1] - r.gain), cost))
             label_kernels.declare(cost, *told)
         else:
             assert r.z is not None
@@ -224,8 +234,8 @@ def by_labels(
             P = contiguous(r.P) if fixed is None else fixed
             cost, at = np.empty((n, labels)), np.empty((n, h, f))
             label_kernels.judge(contiguous(r.z), P, excess, *sets, *told, cost, at)
-            if on_line:
-                z = (sets.points(at) * (sets.labels == label[:, None])[..., None]).sum(axis=1)
+        if on_line and at is not None:
+            z = (sets.points(at) * (sets.labels == label[:, None])[..., None]).sum(axis=1)
         return (following, tested), Verdict(alarm, label, z, Evidence(cost, rise))
 
     return Rule(start, step)
