@@ -135,13 +135,14 @@ def checked(plant: Plant, filter: Filter) -> Filter:
         state = filter.update(s.filter, at, y, seen)
         return Checked(state, checks.update(s.checks, y, seen, filter.read(state)))
 
+    begin, expect = filter.begin, filter.expect
     return filter._replace(
         start=lambda n: Checked(filter.start(n), checks.start(n)),
         predict=lambda s, at: s._replace(filter=filter.predict(s.filter, at)),
         update=update,
         read=lambda s: filter.read(s.filter)._replace(gain=checks.gain(s.checks)),
-        begin=filter.begin and (lambda s, at, y: s._replace(filter=filter.begin(s.filter, at, y))),
-        expect=filter.expect and (lambda s, at: filter.expect(s.filter, at)),
+        begin=None if begin is None else lambda s, at, y: s._replace(filter=begin(s.filter, at, y)),
+        expect=None if expect is None else lambda s, at: expect(s.filter, at),
     )
 
 

@@ -71,7 +71,13 @@ class SensorChecks:
     def gain(self, s: Checks) -> Array:
         """By how much each label fits better than healthy (n, labels)."""
         square = np.maximum(s.square, 1.0)
-        grown = MEMORY * (square - 1.0 - np.log(square))
-        found = np.zeros((len(s.y), self._count))
-        found[:, self._labels] = np.minimum(np.maximum(grown, REPEATED * s.repeats), MOST)
+        return self._by_label(np.maximum(MEMORY * (square - 1.0 - np.log(square)), REPEATED * s.repeats))
+
+    def repeated(self, s: Checks) -> Array:
+        """The part of it that comes of readings that repeat themselves (n, labels)."""
+        return self._by_label(REPEATED * s.repeats)
+
+    def _by_label(self, gain: Array) -> Array:
+        found = np.zeros((len(gain), self._count))
+        found[:, self._labels] = np.minimum(gain, MOST)
         return found
