@@ -180,12 +180,7 @@ def check_scenario(plant: Plant, scenario: FaultScenario) -> None:
         for effect in fault.effects:
             _check_effect(plant, f"faults[{i}]", effect, scenario.steps)
     if isinstance(scenario.sampling, Sampling):
-        check_sampling(plant, scenario.sampling)
-        for name, value in scenario.sampling.delays.items():
-            if value > scenario.steps:
-                raise ValueError(
-                    f"delays: the sensor {name} lags by at most the flight's {scenario.steps} samples, not {value}"
-                )
+        check_sampling(plant, scenario.sampling, scenario.steps)
     plant.label_changes(scenario)  # there is a label for each set of modes that are active at once
     for name in ("reference", "disturbance", "physical"):
         shape = getattr(plant.shapes, name)
@@ -204,13 +199,15 @@ def _check_state(plant: Plant, x0: Sequence[float]) -> None:
             raise ValueError(f"x0: {signal.name} begins within [{low:g}, {high:g}], not at {value:g}")
 
 
-def check_sampling(plant: Plant, sampling: Sampling) -> None:
-    """Raise ValueError where there is no such sensor."""
+def check_sampling(plant: Plant, sampling: Sampling, steps: int) -> None:
+    """Raise ValueError where there is no such sensor, or one lags by more than the flight."""
     names = [s.name for s in plant.outputs]
     for field in ("periods", "delays"):
-        for name in getattr(sampling, field):
+        for name, value in getattr(sampling, field).items():
             if name not in names:
                 raise ValueError(f"{field}: {unknown('sensor', name, names, plant.id)}")
+            if field == "delays" and value > steps:
+                raise ValueError(f"delays: the sensor {name} lags by at most the flight's {steps} samples, not {value}")
 
 
 def _check_effect(plant: Plant, where: str, effect: Effect, steps: int) -> None:

@@ -253,9 +253,9 @@ def with_sampling(plant: Plant, sampling: Sampling) -> Plant:
     """The plant all of whose processes draw flights with sensors that report so.
 
     Raises:
-        ValueError: It has no such sensor.
+        ValueError: It has no such sensor, or one lags by more than a standard flight.
     """
-    check_sampling(plant, sampling)
+    check_sampling(plant, sampling, plant.processes["standard"].sample(np.random.default_rng(0)).steps)
     processes = {
         name: dataclasses.replace(process, sample=_Sampled(process.sample, sampling))
         for name, process in plant.processes.items()
@@ -287,7 +287,8 @@ class Options(msgspec.Struct, kw_only=True, omit_defaults=True, forbid_unknown_f
         if self.feedback not in FEEDBACK:
             raise ValueError(f"unknown feedback {self.feedback!r}; there are {', '.join(FEEDBACK)}")
         fields = ("dropout", "burst", "periods", "delays", "hold")
-        sampling, given = Sampling(**{name: getattr(self, name) for name in fields}), msgspec.to_builtins(self)
+        given = msgspec.to_builtins(self)
+        sampling = msgspec.convert({name: getattr(self, name) for name in fields}, Sampling)
         if self.sensor_faults:
             plant = with_sensor_faults(plant)
         if self.feedback == "healthy":
