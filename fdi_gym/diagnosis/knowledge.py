@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from fdi_gym.diagnosis import fitting
 from fdi_gym.diagnosis.fitting import fit_belief, fit_calibration
 from fdi_gym.diagnosis.registry import Entry, find_diagnoser, package_of
 from fdi_gym.discovery import plant_sources
@@ -28,7 +29,7 @@ from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.data import from_json, to_json
 from fdi_gym.files import write_whole
-from fdi_gym.kernels import cache_folder
+from fdi_gym.kernels import cache_folder, sources
 from fdi_gym.plant import NotApplicableError, Plant
 
 
@@ -90,10 +91,19 @@ def _known(entry: Entry, plant: Plant, kind: str, key: str, make: Any) -> Any:
         found = getattr(shipped, kind).get(key)
         if found is not None:
             return found
-    place = f"{plant.env_id} {code} {kind} {key}"
+    place = f"{plant.env_id} {code} {kind} {key} {_fitting()}"
     if place not in _kept:
         _kept[place] = _on_disk(entry, place, Belief if kind == "beliefs" else Calibration, make)
     return _kept[place]
+
+
+@functools.cache
+def _fitting() -> str:
+    """Digest of the sources that find a fit, beside the method's and the plant's."""
+    digest = hashlib.sha256()
+    for path in sources(Path(fitting.__file__)):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def _on_disk(entry: Entry, place: str, of: Any, make: Any) -> Any:
