@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fdi_gym.checks import is_whole, unknown
+from fdi_gym.options import split_options
 from fdi_gym.plant import Plant
-from fdi_gym.sensors import split_options
 
 _FOLDER = Path(__file__).parent / "plants"
 
@@ -74,7 +74,7 @@ def add_plant_source(plant_id: str, source: PlantSource) -> None:
 
 
 def load_plant(plant_id: str, **options: Any) -> Plant:
-    """Build a plant by id with the options of its data sheet, and those of every plant (`fdi_gym.sensors`).
+    """Build a plant by id with the options of its data sheet, and those of every plant (`fdi_gym.options`).
 
     Raises:
         ValueError: Unknown plant, option or option value (the message lists those that exist), or a builder that does
@@ -95,14 +95,14 @@ def _built(plant_id: str, source: PlantSource, options: dict[str, Any]) -> Plant
         what = f"{type(error).__name__}: {error}"
         raise ValueError(f"{plant_id}: its builder {source.builder!r} cannot be imported: {what}") from error
     try:
-        own, sensors = split_options(options)
+        own, layers = split_options(options)
     except ValueError as error:
         raise ValueError(f"{plant_id}: {error}") from None
     named = [n for n, p in parameters.items() if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
     if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
         for option in own:
             if option not in named:
-                raise ValueError(unknown("option", option, [*named, *sensors.__struct_fields__], plant_id))
+                raise ValueError(unknown("option", option, [*named, *layers.__struct_fields__], plant_id))
     try:
         plant = build(**own)
     except (ValueError, TypeError) as error:
@@ -114,7 +114,7 @@ def _built(plant_id: str, source: PlantSource, options: dict[str, Any]) -> Plant
         made = f"the plant {plant.env_id}" if isinstance(plant, Plant) else repr(plant)
         raise ValueError(f"{source.builder!r} is registered for {plant_id}-Faults-v{source.version}, but returns {made}")
     try:
-        plant = sensors.applied(plant)
+        plant = layers.applied(plant)
     except ValueError as error:
         raise ValueError(f"{plant_id} with the options {options}: {error}") from error
     defaults = {n: parameters[n].default for n in named}

@@ -89,6 +89,7 @@ class Plant(Truth):
         q: Parameters of the controller.
         true_feedback: The controller gets the sensors' values before their noise is added; diagnosers never do.
         healthy_feedback: The controller gets what healthy sensors would say, each at every sample.
+        simultaneous: Any of its modes may act at once, in sets for which there is no label (`fdi_gym.simultaneous`).
         bare: Of a plant whose sensors may fail (`fdi_gym.sensors`): the same without.
         regular: Of a plant whose sensors leave samples out: the same with sensors that report at every one.
         physical: Maps a scenario's physical parameters to the vector p; of {} it gives the nominal model.
@@ -132,6 +133,7 @@ class Plant(Truth):
     q: Array = field(default_factory=lambda: np.zeros(0))
     true_feedback: bool = False
     healthy_feedback: bool = False
+    simultaneous: bool = False
     bare: Plant | None = None
     regular: Plant | None = None
     physical: Callable[[Mapping[str, Any]], Array] = _no_change

@@ -23,6 +23,7 @@ from fdi_gym.plant import Array, Plant, Signal
 from fdi_gym.tasks import TASKS
 
 UNITS = ("physical", "scaled")
+SETS = ("modes", "identification")  # tasks that do not need a label
 
 # Samples that are flown ahead of the agent: few after a reset, since an episode may be short, and twice as many each time.
 # `python benchmarks/engine.py --chunks` measures what the two cost.
@@ -142,6 +143,10 @@ class Rules:
         if isinstance(plant, Plant) and options:
             raise ValueError(f"{plant.id} is built already: the options {', '.join(options)} come too late")
         self.plant = load_plant(plant, **options) if isinstance(plant, str) else plant
+        if self.plant.simultaneous and task not in SETS:
+            raise ValueError(
+                f"where faults act at once, no label says which: the task is one of {', '.join(SETS)}, not {task!r}"
+            )
         self.mismatch = self._checked_mismatch(mismatch)
         self.task = TASKS[task](self.plant, units == "scaled")
         if scenario is not None and (process is not None or mismatch is not None):

@@ -24,10 +24,9 @@ larger. `dropout`, `burst`, `periods`, `delays` and `hold` are no faults: `fdi_g
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
-import msgspec
 import numpy as np
 
 from fdi_gym.checks import check_sampling
@@ -37,7 +36,6 @@ from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Ramp, Sam
 from fdi_gym.model import SENSOR_FAULTS, Array
 from fdi_gym.plant import Plant
 
-FEEDBACK = ("faulty", "healthy")
 KINDS = ("bias", "drift", "gain", "freeze", "noise", "spikes")  # what the processes draw, alike often
 LONGEST_LAG = 1000.0  # samples
 FROM, TO = 0.15, 0.65  # onsets, as shares of the flight
@@ -261,59 +259,3 @@ def with_sampling(plant: Plant, sampling: Sampling) -> Plant:
         for name, process in plant.processes.items()
     }
     return dataclasses.replace(plant, processes=processes)
-
-
-# ---------------------------------------------------------------------------------------------------------------
-# Options of every plant
-
-
-class Options(msgspec.Struct, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
-    """What `load_plant` and every environment take beside a plant's own options; see the module's docstring."""
-
-    sensor_faults: bool = False
-    feedback: str = "faulty"
-    dropout: float = 0.0
-    burst: float = 1.0
-    periods: dict[str, int] = {}
-    delays: dict[str, int] = {}
-    hold: bool = False
-
-    def applied(self, plant: Plant) -> Plant:
-        """The plant with them.
-
-        Raises:
-            ValueError: A value that is not allowed, or a sensor that the plant does not have.
-        """
-        if self.feedback not in FEEDBACK:
-            raise ValueError(f"unknown feedback {self.feedback!r}; there are {', '.join(FEEDBACK)}")
-        fields = ("dropout", "burst", "periods", "delays", "hold")
-        given = msgspec.to_builtins(self)
-        sampling = msgspec.convert({name: getattr(self, name) for name in fields}, Sampling)
-        if self.sensor_faults:
-            plant = with_sensor_faults(plant)
-        if self.feedback == "healthy":
-            plant = dataclasses.replace(plant, healthy_feedback=True)
-        lasting = {name: value for name, value in given.items() if name in ("sensor_faults", "feedback", "delays")}
-        regular = with_sampling(plant, Sampling(delays=self.delays)) if self.delays else plant
-        regular = dataclasses.replace(regular, options={**plant.options, **lasting}) if lasting else regular
-        if given == lasting:
-            return regular
-        return dataclasses.replace(with_sampling(plant, sampling), regular=regular, options={**plant.options, **given})
-
-
-def split_options(options: Mapping[str, Any]) -> tuple[dict[str, Any], Options]:
-    """The options of a plant: its own, and those of every plant.
-
-    `feedback` is the sensors' where its value is one of `FEEDBACK`; a plant may have an option of that name.
-
-    Raises:
-        ValueError: A value of another type.
-    """
-    layer = {name: value for name, value in options.items() if name in Options.__struct_fields__}
-    if "feedback" in layer and layer["feedback"] not in FEEDBACK:
-        del layer["feedback"]
-    try:
-        found = msgspec.convert(msgspec.to_builtins(layer), Options)
-    except (msgspec.ValidationError, TypeError) as error:
-        raise ValueError(f"{error}; the options of sensors are {', '.join(Options.__struct_fields__)}") from None
-    return {name: value for name, value in options.items() if name not in layer}, found

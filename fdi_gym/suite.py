@@ -19,8 +19,8 @@ from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.faults import MAX_STEPS, FaultScenario, draw
 from fdi_gym.files import RefusedError, digest, pretty, read_json, write_whole
 from fdi_gym.names import blame, check_diagnoser_name, check_name, find_function, find_module, unknown
+from fdi_gym.options import Options
 from fdi_gym.plant import Plant
-from fdi_gym.sensors import Options
 
 _PACKAGED = Path(__file__).parent / "suites"
 _CHECKOUT = Path(__file__).parent.parent / "leaderboards" / "suites"
@@ -206,6 +206,8 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise ValueError(f"{self.name} is of {env_id!r}; this {self.plant} is {plant.env_id}")
         if self.mismatch is not None and plant.perturb is None:
             raise ValueError(f"{self.plant} has no mismatch")
+        if plant.simultaneous:
+            raise ValueError("a suite scores labels; sets of modes are scored by fdi_gym.simultaneous.scores")
         return plant
 
     def scenarios(self, plant: Plant, episodes: Sequence[int]) -> list[FaultScenario]:
