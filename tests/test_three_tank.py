@@ -279,7 +279,7 @@ def test_what_does_not_fit_is_refused(plant):
         ("reference", {"levels": [[0.4]]}, "levels"), ("reference", {"level": [[0.4, 0.2]]}, "level"),
         ("disturbance", {"sigma": 0.02}, "seed is missing"), ("disturbance", {"sigma": 0.2, "seed": 1}, "0.1"),
         ("disturbance", {"sigma": 0.02, "seed": -1}, "seed"), ("physical", {"az31": 0.4}, "az31"),
-        ("physical", {"az13": 0.0}, "az13"),
+        ("physical", {"az13": -0.1}, "az13"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=says):
             plant.validate(scenario_of(**{field: value}))

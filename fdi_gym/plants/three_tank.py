@@ -159,7 +159,7 @@ X_TRIM, U_TRIM = trim()
 # Scenarios
 
 Height = Annotated[float, Meta(ge=0.0, le=0.6)]  # m
-Coefficient = Annotated[float, Meta(ge=0.01, le=2.0)]
+Coefficient = Annotated[float, Meta(ge=0.0, le=2.0)]
 Spread = Annotated[float, Meta(ge=0.0, le=0.1)]  # d stays far from -1, a closed drain
 
 
