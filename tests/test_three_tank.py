@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fdi_gym.closed_loop import BIAS, FAULTS
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import Flights, advance, no_noise, simulate
-from fdi_gym.faults import Abrupt, FaultScenario, Incipient, Intermittent, draw
+from fdi_gym.faults import Abrupt, Fault, FaultScenario, Incipient, Intermittent, draw
 from fdi_gym.plants import three_tank as tank
+from fdi_gym.sensors import sensor_mode
 from fdi_gym.testing import check_plant
 
 TRIM = (0.40, 0.20, 0.2957466063348417)
@@ -40,12 +40,14 @@ def scenario_of(faults=(), steps=400, **dicts):
     return FaultScenario(plant=tank.ID, steps=steps, faults=[tank.fault(*f) for f in faults], **dicts)
 
 
-def quiet(plant, scenario, bias=0.0, sensor=0, onset=50):
+def quiet(plant, scenario, bias=0.0, sensor="h1", onset=50):
     """A flight without noise, one sensor biased [m] from a sample on: the flights and what was flown."""
-    sensors = np.zeros((scenario.steps + 1, 1, 3, FAULTS))
-    sensors[onset:, 0, sensor, BIAS] = bias
+    if bias:
+        plant = load_plant("ThreeTank", sensor_faults=True)
+        fault = Fault(sensor_mode(sensor), "bias", onset, [Abrupt(f"bias_{sensor}", bias)])
+        scenario = scenario.replace(faults=[*scenario.faults, fault])
     flights = Flights(plant, [scenario], [no_noise(plant, scenario.steps)])
-    return flights, advance(flights, scenario.steps + 1, sensors=sensors)
+    return flights, advance(flights, scenario.steps + 1)
 
 
 def balances(h, u, theta, d, az=(0.46, 0.48, 0.58)):
