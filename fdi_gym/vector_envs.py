@@ -13,10 +13,9 @@ from fdi_gym import rules
 from fdi_gym.engine import Record, advance, simulate
 from fdi_gym.faults import FaultScenario
 from fdi_gym.flights import Flights, Prepared
+from fdi_gym.next_flights import NextFlights
 from fdi_gym.plant import Array, Plant
 from fdi_gym.rules import Rules, Specified, ahead, checked_mask, checked_seeds, whole
-
-TOGETHER = 8  # flights that are prepared in one step: the first of them finds cold caches
 
 
 class FDIVectorEnv(Specified, VectorEnv):
@@ -78,9 +77,7 @@ class FDIVectorEnv(Specified, VectorEnv):
         self._over = np.ones(num_envs, dtype=bool)
         self._waits, self._fresh = True, True  # whether any episode is over, and whether any has just begun
         self._all = np.arange(num_envs)
-        self._coming: dict[int, tuple[int, Prepared]] = {}  # the next flight of an environment, and the seed that it has
-        self._queue: list[int] = []  # whose next flight is prepared next, the first one last
-        self._pace, self._owed = 0.0, 0.0  # how many of them in each step
+        self._next = NextFlights(self._prepared)
         self._declared: list[list[tuple[int, Array]]] = [[] for _ in range(num_envs)]
         self._records: dict[int, Record] = {}
         self._canvas: Any = None
@@ -126,19 +123,16 @@ class FDIVectorEnv(Specified, VectorEnv):
 
     def _begin(self, slots: Array, seeds: list[int | None], replay: FaultScenario | None = None) -> None:
         """Begin an episode in each of these environments, at the row where all are."""
-        ready: list[Prepared | None] = []
+        prepared: list[Prepared | None] = []
         for i in slots.tolist():
             seed = seeds[i]
             if seed is None:
                 episode_seed = int(self._rng(i).integers(2**63))
             else:
                 episode_seed, self._seeds[i], self._rngs[i] = seed, seed, None
-            expected, flight = self._coming.pop(i, (-1, None))
-            ready.append(flight if expected == episode_seed and replay is None else None)
-            if ready[-1] is None:
-                self.scenarios[i] = self._rules.draw(episode_seed) if replay is None else replay
-            else:
-                self.scenarios[i] = ready[-1].scenario
+            flight = self._next.take(i, episode_seed)
+            prepared.append(flight if replay is None else None)
+            self.scenarios[i] = replay or (flight.scenario if flight else self._rules.draw(episode_seed))
             self._declared[i] = []
             self._records.pop(i, None)
         scenarios = [s for i in slots if (s := self.scenarios[i]) is not None]
@@ -150,8 +144,9 @@ class FDIVectorEnv(Specified, VectorEnv):
                 np.zeros((*self._buffer.label.shape, len(self.plant.estimated)))  # fmt: skip
             self._row = np.zeros(self.num_envs, np.int64)
         else:
-            made = [flight or self._flights.prepare(s) for flight, s in zip(ready, scenarios, strict=True)]
-            self._flights.put(slots, made)
+            self._flights.put(
+                slots, [flight or self._flights.prepare(s) for flight, s in zip(prepared, scenarios, strict=True)]
+            )
         if slots.size == self.num_envs:
             self._now, self._ahead = self._rules.period - 1, ahead(0, self._rules.period)
             self._filled = self._now + 1 + self._ahead
@@ -178,39 +173,14 @@ class FDIVectorEnv(Specified, VectorEnv):
         self._now, self._ahead = m - 1, ahead(self._ahead, m)
         self._filled = m + self._ahead
         self._fly(m, self._all)
-        self._plan()
+        if self._mode is not AutoresetMode.DISABLED:
+            under_way = np.flatnonzero(~self._over)
+            self._next.plan(under_way, (self._flights.length - self._k)[under_way] // m)  # type: ignore[union-attr]
 
-    def _plan(self) -> None:
-        """In which order the next flights are prepared, and how many per step, so that each is ready when it is wanted.
-
-        Flights of one length end together; what is spread over the steps before does not stall the step that ends them.
-        """
+    def _prepared(self, seed: int) -> Prepared:
+        """The flight of an episode's seed."""
         assert self._flights is not None
-        missing = [i for i in self._all[~self._over].tolist() if i not in self._coming]
-        if self._mode is AutoresetMode.DISABLED or not missing:
-            self._queue, self._pace = [], 0.0
-            return
-        left = np.maximum((self._flights.length - self._k)[missing] // self._rules.period, 1)
-        order = np.argsort(left, kind="stable")
-        self._queue = np.array(missing)[order][::-1].tolist()
-        self._pace = float((np.arange(1, len(missing) + 1) / left[order]).max())
-
-    def _prepare(self) -> None:
-        """The share of a step: draw and prepare the next flights of some environments, whose generators stay as they are."""
-        self._owed += self._pace
-        if self._owed < TOGETHER:
-            return
-        due, self._owed = int(self._owed), 0.0
-        for i in reversed(self._queue[-due:]):
-            rng = self._rng(i)
-            state = rng.bit_generator.state
-            seed = int(rng.integers(2**63))
-            rng.bit_generator.state = state
-            try:
-                self._coming[i] = seed, self._flights.prepare(self._rules.draw(seed))  # type: ignore[union-attr]
-            except Exception:  # it is told when the flight begins, if it does
-                pass
-        del self._queue[-due:]
+        return self._flights.prepare(self._rules.draw(seed))
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Step every environment; those that ended are treated as the autoreset mode says.
@@ -237,8 +207,7 @@ class FDIVectorEnv(Specified, VectorEnv):
                 self._declared[i].append((int(k[i]), checked[i]))
         if self._now + 1 == self._filled:
             self._fly_all()
-        if self._queue:
-            self._prepare()
+        self._next.prepare(self._rng)
         period = self._rules.period
         self._k = np.minimum(k + period, flights.length)
         if waits:
