@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi_gym import closed_loop
+from fdi_gym.bounds import check_bounds
 from fdi_gym.closed_loop import FLYING, OVER, TERMINATED
 from fdi_gym.faults import Abrupt, FaultScenario, Hold, Incipient, Intermittent, Samples, Square
 from fdi_gym.model import contiguous
@@ -59,7 +60,7 @@ class Flights:
         length: (N,) its last sample: as the scenario says, until it ends early.
 
     Raises:
-        ValueError: A scenario that the plant refuses, or noise of another shape.
+        ValueError: A scenario that the plant refuses, noise of another shape, or a kernel that reaches beyond its arrays.
     """
 
     def __init__(
@@ -69,6 +70,7 @@ class Flights:
         noise: Sequence[tuple[Array, Array]] | None = None,
         longest_lag: int = 0,
     ):
+        check_bounds(plant)
         n = len(scenarios)
         n_x, n_y, n_u, n_theta = (len(a) for a in (plant.states, plant.outputs, plant.commands, plant.theta))
         self.plant = plant
