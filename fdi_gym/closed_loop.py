@@ -82,7 +82,7 @@ def _effects(k, seen, dt, table, count, values, held, nominal, a, b, g):
     return drifts
 
 
-@numba.njit
+@numba.njit(inline="always")
 def _sense(k, y, z, row, sigma, limit, injected, v, sensors, s, slot, box, history, last, reading, shown):
     """What the sensors say: `reading` (what the controller gets) and `shown` (NaN where a sensor does not report)."""
     for i in range(y.size):

@@ -13,7 +13,7 @@ def _theta_at(tau, a, b, g, theta):
         theta[j] = a[j] if b[j] == 0.0 else a[j] + b[j] * np.exp(-g[j] * tau)
 
 
-@numba.njit
+@numba.njit(inline="always")
 def interval(dynamics, project, t, dt, substeps, x, u, drifts, a, b, g, d, p, theta, k1, k2, k3, k4, z):
     """One sample interval: x(t) -> x(t + dt) in place, theta(t + tau) = a + b exp(-g tau), u and d held.
 
