@@ -115,7 +115,7 @@ def _wrong(k, tabled, sensors, s, slot, layered, theta, own, reports, reporting,
                 f[i, MISSING] += dropped[i]
 
 
-@numba.njit
+@numba.njit(inline="always")
 def _sense(
     k, y, z, row, sigma, limit, injected, v, faulty, f, again, true_feedback, healthy, box, history, last, shown, fed
 ):

@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import Meta
 
 from fdi_gym.drawing import stream
-from fdi_gym.plain import of_numpy, plain, value_at
+from fdi_gym.plain import UsualDict, of_numpy, plain, value_at
 
 MAX_STEPS = 1_000_000  # samples of a flight: what is recorded of it takes a gigabyte or less
 MAX_JSON = 2**25  # bytes of a scenario as text
@@ -155,6 +155,27 @@ class _Fields(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     sampling: Sampling | msgspec.UnsetType = msgspec.UNSET
 
 
+class _Usual(_Fields, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The same with dicts no deeper than the usual ones: what msgspec can check and copy in one pass."""
+
+    reference: UsualDict = {}
+    disturbance: UsualDict = {}
+    physical: UsualDict = {}
+
+
+def _usual(scenario: _Fields) -> _Fields | None:
+    """A checked copy of a scenario that holds Python's own values in the usual depth; None: of another, or a wrong one."""
+    try:
+        copy = msgspec.convert(msgspec.to_builtins(scenario), _Usual)
+        for name in DICTS:
+            given = getattr(scenario, name)
+            if type(given) is not dict or getattr(copy, name) != given:  # msgspec also makes lists of sets
+                return None
+    except Exception:  # whatever it is, it is searched and named by those who take longer
+        return None
+    return copy
+
+
 class FaultScenario(_Fields, frozen=True, kw_only=True):
     """One realisation: everything that is drawn for an episode. Survives a JSON round trip as an equal object.
 
@@ -178,6 +199,13 @@ class FaultScenario(_Fields, frozen=True, kw_only=True):
     """
 
     def __post_init__(self) -> None:
+        checked = _usual(self) or self._checked()
+        for name in self.__struct_fields__:
+            msgspec.structs.force_setattr(self, name, getattr(checked, name))
+        _check_windows(checked.faults)
+
+    def _checked(self) -> _Fields:
+        """A checked copy of any scenario, or the error that says what is wrong with it."""
         given: dict[str, Any] = {name: getattr(self, name) for name in self.__struct_fields__}
         dicts = {name: plain(given[name], name) for name in DICTS}
         unset = {name for name, value in given.items() if value is msgspec.UNSET}
@@ -189,9 +217,9 @@ class FaultScenario(_Fields, frozen=True, kw_only=True):
             raise ValueError(f"not a FaultScenario: {error}{value_at(str(error), data)}") from None
         except RecursionError:
             raise ValueError("not a FaultScenario: it contains itself") from None
-        for name in given:
-            msgspec.structs.force_setattr(self, name, dicts[name] if name in dicts else getattr(checked, name))
-        _check_windows(checked.faults)
+        for name in DICTS:
+            msgspec.structs.force_setattr(checked, name, dicts[name])
+        return checked
 
     def to_json(self) -> str:
         """The scenario as JSON text.

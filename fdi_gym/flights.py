@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi_gym import closed_loop
+from fdi_gym.bounds import check_bounds
 from fdi_gym.closed_loop import FLYING, OVER, TERMINATED
 from fdi_gym.faults import Abrupt, Effect, FaultScenario, Hold, Incipient, Intermittent, Ramp, Samples, Sampling, Square
 from fdi_gym.model import contiguous
@@ -28,9 +29,10 @@ class Chunk(NamedTuple):
     label: Array  # (m, N) int64
 
 
-class _Made(NamedTuple):
-    """What a flight follows: tables, the true label's changes, injected noise."""
+class Prepared(NamedTuple):
+    """A flight that can begin: its scenario, tables, the true label's changes, injected noise."""
 
+    scenario: FaultScenario
     inputs: Inputs
     labels: list[tuple[int, int]]
     noise: tuple[Array | None, Array | None]
@@ -74,7 +76,7 @@ class Flights:
         length: (N,) its last sample: as the scenario says, until it ends early.
 
     Raises:
-        ValueError: A scenario that the plant refuses, or noise of another shape.
+        ValueError: A scenario that the plant refuses, noise of another shape, or a kernel that reaches beyond its arrays.
     """
 
     def __init__(
@@ -84,6 +86,7 @@ class Flights:
         noise: Sequence[tuple[Array, Array]] | None = None,
         longest_lag: int = 0,
     ):
+        check_bounds(plant)
         n = len(scenarios)
         n_x, n_y, n_u, n_theta = (len(a) for a in (plant.states, plant.outputs, plant.commands, plant.theta))
         self.plant = plant
@@ -134,19 +137,33 @@ class Flights:
         noise: Sequence[tuple[Array, Array]] | None = None,
     ) -> None:
         """Put new flights in these slots; the others go on. What is refused leaves all as they are."""
+        made = [self.prepare(s, None if noise is None else noise[number]) for number, s in enumerate(scenarios)]
+        self.put(slots, made)
+
+    def prepare(self, scenario: FaultScenario, noise: tuple[Array, Array] | None = None) -> Prepared:
+        """A flight that `put` can begin at any time: what takes long is done here.
+
+        Raises:
+            ValueError: A scenario that the plant refuses, or noise of another shape.
+        """
+        self.plant.validate(scenario)
+        given = (None, None) if noise is None else self._checked_noise(noise, scenario.steps)
+        return Prepared(scenario, self.plant.inputs(scenario), self.plant.label_changes(scenario), given)
+
+    def put(self, slots: Iterable[int], made: Sequence[Prepared]) -> None:
+        """Begin prepared flights in these slots; the others go on."""
         plant, where = self.plant, np.array(list(slots))
-        made = [self._made(s, None if noise is None else noise[number]) for number, s in enumerate(scenarios)]
         if len(where) != len(made):
             raise ValueError(f"one scenario for each of the {len(where)} slots is needed, not {len(made)}")
         if not made:
             return
         self.k[where], self.status[where], self.x[where], self.c[where] = 0, FLYING, plant.trim_state, plant.c0
         self.u[where], self.theta[where] = plant.trim_command, plant.nominal_theta
-        self.length[where] = [scenario.steps for scenario in scenarios]
-        self.seed[where] = np.array([scenario.noise_seed for scenario in scenarios], np.uint64)
-        self.p[where] = [inputs.physical for inputs, *_ in made]
-        self.steps[:, where] = np.array([(len(i.reference) > 1, len(i.disturbance) > 1) for i, *_ in made]).T
-        for i, scenario, (inputs, labels, given) in zip(where.tolist(), scenarios, made, strict=True):
+        self.length[where] = [flight.scenario.steps for flight in made]
+        self.seed[where] = np.array([flight.scenario.noise_seed for flight in made], np.uint64)
+        self.p[where] = [flight.inputs.physical for flight in made]
+        self.steps[:, where] = np.array([(len(f.inputs.reference) > 1, len(f.inputs.disturbance) > 1) for f in made]).T
+        for i, (scenario, inputs, labels, given) in zip(where.tolist(), made, strict=True):
             if scenario.x0 is not None:
                 self.x[i] = scenario.x0
             samples = self._set_effects(i, scenario)
@@ -154,12 +171,6 @@ class Flights:
             self._set_labels(i, labels)
             self.tables[i] = (inputs.reference, inputs.disturbance, *given, samples)
             self._point(i)
-
-    def _made(self, scenario: FaultScenario, noise: tuple[Array, Array] | None) -> _Made:
-        """What a scenario that the plant accepts makes."""
-        self.plant.validate(scenario)
-        given = (None, None) if noise is None else self._checked_noise(noise, scenario.steps)
-        return _Made(self.plant.inputs(scenario), self.plant.label_changes(scenario), given)
 
     def _checked_noise(self, noise: tuple[Array, Array], steps: int) -> tuple[Array, Array]:
         w, v = (contiguous(a) for a in noise)

@@ -16,7 +16,7 @@ def _theta_at(tau, a, b, g, theta):
             theta[j] = a[j] + b[j] * (tau if g[j] < 0.0 else np.exp(-g[j] * tau))
 
 
-@numba.njit
+@numba.njit(inline="always")
 def interval(dynamics, project, t, dt, substeps, x, u, drifts, a, b, g, d, p, theta, k1, k2, k3, k4, z):
     """One sample interval: x(t) -> x(t + dt) in place, theta(t + tau) = a + b exp(-g tau), or a + b tau where g < 0.
 
