@@ -96,6 +96,9 @@ def _statements(body: Iterable[ast.AST]) -> Iterator[ast.AST]:
             yield from _statements(getattr(node, part, ()))
 
 
+# What only kernels call needs no way in from Python or C, which takes longer to compile than many an equation.
+helper = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
 _signatures: dict[Any, Any] = {}  # of the kernels, compiled when they are first needed
 _announced: set[str] = set()  # source files whose cold compilation has been announced
 _compiling = threading.RLock()
@@ -173,7 +176,7 @@ class _Cache(caching.FunctionCache):
 def _lazily(function: Callable[..., Any], signature: Any) -> Any:
     """The function as numba's dispatcher, cached in the folder of its sources; nothing is compiled yet."""
     folder = cache_folder(function.__code__.co_filename)
-    dispatcher = numba.njit(error_model="numpy", nogil=True)(function)
+    dispatcher = numba.njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True)(function)
     if folder is not None:
         settings: Any = config
         before = settings.CACHE_DIR
@@ -188,7 +191,7 @@ def _lazily(function: Callable[..., Any], signature: Any) -> Any:
     return dispatcher
 
 
-def _load(dispatcher: Any) -> Any:
+def load(dispatcher: Any) -> Any:
     """The dispatcher, compiled for its role's signature or loaded from the cache."""
     if dispatcher.overloads:
         return dispatcher
@@ -204,6 +207,13 @@ def _load(dispatcher: Any) -> Any:
     return dispatcher
 
 
+def uncompiled(modules: Iterable[str]) -> list[Any]:
+    """The kernels of these modules, as far as they are imported, that the cache should have and does not have yet."""
+    ours = set(modules)
+    found = [d for d in _signatures if d.py_func.__module__ in ours and not d.overloads and isinstance(d._cache, _Cache)]
+    return [d for d in found if not Path(d._cache._cache_file._index_path).is_file()]
+
+
 def kernel(function: Callable[..., Any]) -> Any:
     """Make a plant's function a kernel of the role that its parameter names declare (see the module's docstring)."""
     role = _ROLES.get(tuple(inspect.signature(function).parameters))
@@ -216,16 +226,10 @@ def compiled(signature: Any) -> Callable[[Any], Any]:
     """Make a generic kernel: compiled for this signature at its first call, cached; it runs without the GIL."""
 
     def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher, loaded = _lazily(function, signature), None
-
-        @functools.wraps(function)
-        def call(*arguments: Any) -> Any:
-            nonlocal loaded
-            if loaded is None:
-                loaded = _load(dispatcher)
-            return loaded(*arguments)
-
-        return call
+        dispatcher = _lazily(function, signature)
+        # what numba asks where nothing fits, at the first call, and then calls; later calls go to the machine code directly
+        dispatcher._compile_for_args = lambda *arguments: load(dispatcher)
+        return dispatcher
 
     return decorate
 
@@ -253,7 +257,7 @@ def _arrived(module: str, name: str) -> Any:
 
 def address(dispatcher: Any) -> int:
     """The address of a kernel, compiled if need be, by which the generic kernels call it. Valid as long as it lives."""
-    (result,) = _load(dispatcher).overloads.values()
+    (result,) = load(dispatcher).overloads.values()
     return result.library.get_pointer_to_function(result.fndesc.llvm_func_name)
 
 
