@@ -24,7 +24,7 @@ def compile_kernels(modules: Collection[str], jobs: int = -1, progress: bool = T
     missing = sorted(uncompiled(modules), key=lambda kernel: -kernel.py_func.__code__.co_argcount)
     if len(missing) < 2:
         return
-    parallel: Any = joblib.Parallel(n_jobs=jobs, batch_size=1, return_as="generator_unordered")
+    parallel: Any = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
     with tqdm(total=len(missing), desc="compiling, once", unit="kernel", disable=not progress, leave=False) as bar:
         for _ in parallel(joblib.delayed(_compile)(k.py_func.__module__, k.py_func.__name__) for k in missing):
             bar.update()

@@ -32,7 +32,7 @@ import os
 import pickle
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -96,8 +96,8 @@ def _statements(body: Iterable[ast.AST]) -> Iterator[ast.AST]:
             yield from _statements(getattr(node, part, ()))
 
 
-# What only kernels call needs no way in from Python or C, which takes longer to compile than many an equation.
-helper = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+njit: Any = numba.njit  # what only kernels call needs no way in from Python or C, slow to compile: `helper`
+helper = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 _signatures: dict[Any, Any] = {}  # of the kernels, compiled when they are first needed
 _announced: set[str] = set()  # source files whose cold compilation has been announced
@@ -176,7 +176,7 @@ class _Cache(caching.FunctionCache):
 def _lazily(function: Callable[..., Any], signature: Any) -> Any:
     """The function as numba's dispatcher, cached in the folder of its sources; nothing is compiled yet."""
     folder = cache_folder(function.__code__.co_filename)
-    dispatcher = numba.njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True)(function)
+    dispatcher = njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True)(function)
     if folder is not None:
         settings: Any = config
         before = settings.CACHE_DIR
@@ -207,10 +207,9 @@ def load(dispatcher: Any) -> Any:
     return dispatcher
 
 
-def uncompiled(modules: Iterable[str]) -> list[Any]:
+def uncompiled(modules: Collection[str]) -> list[Any]:
     """The kernels of these modules, as far as they are imported, that the cache should have and does not have yet."""
-    ours = set(modules)
-    found = [d for d in _signatures if d.py_func.__module__ in ours and not d.overloads and isinstance(d._cache, _Cache)]
+    found = [d for d in _signatures if d.py_func.__module__ in modules and not d.overloads and isinstance(d._cache, _Cache)]
     return [d for d in found if not Path(d._cache._cache_file._index_path).is_file()]
 
 
@@ -227,8 +226,7 @@ def compiled(signature: Any) -> Callable[[Any], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         dispatcher = _lazily(function, signature)
-        # what numba asks where nothing fits, at the first call, and then calls; later calls go to the machine code directly
-        dispatcher._compile_for_args = lambda *arguments: load(dispatcher)
+        dispatcher._compile_for_args = lambda *_: load(dispatcher)  # numba asks this where nothing fits, and calls it
         return dispatcher
 
     return decorate

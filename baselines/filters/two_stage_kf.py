@@ -96,7 +96,7 @@ def predict(s: TwoStage, u: Array, model: LinearModel, Q: Array, Pz_minus: Array
 
 def correct(s: TwoStage, y: Array, seen: Array, C: Array, R: Array) -> TwoStage:
     """With the measurement y_{k+1} of the sensors that reported (n, n_y), eqs. 32 to 41."""
-    new = TwoStage(*(np.empty(a.shape, a.dtype) for a in s))
+    new = TwoStage(*map(np.empty_like, s))
     kernels.correct(s.x, s.Px, s.z, s.Pz, s.V, y, seen, C, contiguous(R), *new)
     return new
 
