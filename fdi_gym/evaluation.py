@@ -19,13 +19,14 @@ import msgspec
 from tqdm import tqdm
 
 import fdi_gym
+from fdi_gym.compilation import compile_kernels
 from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, make_diagnoser, run
 from fdi_gym.engine import Record, simulate
 from fdi_gym.files import RefusedError, digest, read_json, sweep, write_whole
 from fdi_gym.metrics import Outcome, outcome
 from fdi_gym.names import blamed, file_name
 from fdi_gym.plant import Plant
-from fdi_gym.provenance import provenance
+from fdi_gym.provenance import provenance, sources
 from fdi_gym.row import Evaluated, Made, Row, outcomes_digest
 from fdi_gym.scores import summarise
 from fdi_gym.suite import Suite
@@ -261,6 +262,7 @@ def evaluate(
     plan = _Plan(suite, plant, list(dict.fromkeys(names)), work, block)
     plan.folder.mkdir(parents=True, exist_ok=True)
     sweep(plan.folder)
+    compile_kernels(sources({__name__, *(find_diagnoser(name).build.__module__ for name in plan.names)}), jobs, progress)
     total = len(plan.names) * len(plan.ranges)
     parallel: Any = joblib.Parallel(n_jobs=min(jobs, total), return_as="generator_unordered")
     with tqdm(total=total, desc=suite.name, unit="block", disable=not progress) as bar:

@@ -16,7 +16,7 @@ from fdi_gym.diagnosis import (
     make_diagnoser,
     trainers,
 )  # fmt: skip
-from fdi_gym.diagnosis.registry import GIVEN
+from fdi_gym.diagnosis.registry import GIVEN, GROUPS
 from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.faults import draw
 from fdi_gym.names import blamed, find_module, unknown
@@ -45,7 +45,9 @@ def overview() -> str:
     """Names of all environments, suites, diagnosers and trainers, with a line for each; what is broken is listed as such."""
     lines = ["Environments", *(f"  {name}-Faults-v{source.version}" for name, source in plant_sources().items())]
     lines += ["", "Suites", *(f"  {name:32s} {_said(lambda n=name: load_suite(n).description)}" for name in suite_names())]
-    lines += ["", "Diagnosers", *(f"  {name:32s} {entry.summary}" for name, entry in diagnosers().items())]
+    marked = {name: "*" if GROUPS["reference"](entry) else "" for name, entry in diagnosers().items()}
+    lines += ["", 'Diagnosers (*: in the group "reference"; "all" is the group of all)']
+    lines += [f"  {name:30s} {marked[name]:1s} {entry.summary}" for name, entry in diagnosers().items()]
     lines += ["", "Trainers", *(f"  {name:32s} {found.summary}" for name, found in trainers().items())]
     if broken := broken_plugins():
         lines += ["", "Broken plug-ins", *(f"  {name:32s} {reason}" for name, reason in broken.items())]

@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 
 Array = np.ndarray
+FLOAT = np.dtype(float)
 
 SENSOR_FAULTS = ("gain", "bias", "noise", "frozen", "lag", "missing")  # columns of `fdi_gym.sensors`, in order
 
 
 def contiguous(a: Any) -> Array:
     """As the compiled kernels take an array: float64, in C order and writable; a copy only of one that is not."""
+    if type(a) is Array and a.dtype is FLOAT and a.flags.carray:
+        return a
     a = np.ascontiguousarray(a, float)
     return a if a.flags.writeable else a.copy()
 

@@ -55,7 +55,7 @@ def test_the_short_ways_give_the_scenarios_and_flights_of_the_long_ones(plant, t
     {"a": [1, 2.5, True, None, "x", -0.0]}, {"a": {"b": [1e300]}}, {}, {"a": (1, 2)}, {"a": {1, 2}}, {"a": np.arange(3)},
     {"a": float("nan")}, {"a": [float("inf")]}, {"a": 2**63}, {1: 2}, {"a": [[[[1]]]]}, {"a": b"x"}, {"a": object()}, 3,
     None, [("a", 1)], {"a": 1e301}, {"a": msgspec.UNSET},
-], ids=repr)  # fmt: skip
+], ids=lambda value: type(value).__name__ if "object" in repr(value) else repr(value))  # fmt: skip
 def test_the_short_way_takes_and_refuses_what_the_long_way_does(the_long_way, field, value):
     def made():
         try:

@@ -133,7 +133,9 @@ def bank(b: Hypotheses) -> Filter:
     return Filter(start, predict, update, read, expect=lambda s, at: model.expect(state(s), at))
 
 
-@diagnoser("multiple_model_ekf", "Interacting multiple models, one extended Kalman filter per label, for any plant")
+@diagnoser(
+    "multiple_model_ekf", "Interacting multiple models, one extended Kalman filter per label, for any plant", reference=True
+)
 def multiple_model_ekf(plant: Plant, belief: Belief, calibration: Calibration) -> Diagnoser:
     """The bank with its decision.
 

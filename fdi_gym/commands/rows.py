@@ -13,7 +13,7 @@ from fdi_gym.commands.arguments import WIDTH, Names, SuiteName
 
 def evaluate(
     suite: SuiteName,
-    diagnosers: Names = ("all",),
+    diagnosers: Names = ("reference",),
     results: Path | None = None,
     work: Path = Path("runs"),
     jobs: int = -1,
@@ -27,7 +27,8 @@ def evaluate(
 
     Args:
         suite: Name of a suite, or path of a suite file.
-        diagnosers: Names; "all" for every one that can run on the suite's plant; "module:function" for your own.
+        diagnosers: Names; "reference" for those that others are compared with first, "all" for every one, of which those
+            run that can on the suite's plant; "module:function" for your own.
         results: Folder for the rows; without it nothing but the table is made.
         work: Folder of finished blocks. A killed run goes on from there.
         jobs: Worker processes, -1 for one per core.
@@ -38,7 +39,7 @@ def evaluate(
         replace: Rows in the folder that other sources, settings or data have made may go.
     """
     from fdi_gym import evaluation, leaderboard, row, tables
-    from fdi_gym.diagnosis import diagnosers as known
+    from fdi_gym.diagnosis import named
     from fdi_gym.files import write_whole
     from fdi_gym.names import unknown
     from fdi_gym.suite import load_suite
@@ -51,8 +52,7 @@ def evaluate(
     frozen = load_suite(suite)
     frozen = frozen if episodes is None else frozen.head(episodes)
     plant = frozen.build()
-    names = list(known()) if diagnosers == ("all",) else list(dict.fromkeys(diagnosers))
-    names, reasons = evaluation.applicable(frozen, plant, names)
+    names, reasons = evaluation.applicable(frozen, plant, named(diagnosers))
     for name, reason in reasons.items():
         print(f"{name}: not applicable: {reason}", file=sys.stderr)
     if not names:

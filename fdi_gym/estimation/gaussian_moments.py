@@ -17,18 +17,15 @@ in an order that no batch changes. Matrices are kept transposed (`first`, `cross
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from fdi_gym.integration import interval
-from fdi_gym.kernels import map_at, project_at
+from fdi_gym.kernels import helper, map_at, project_at
 
 EXTENDED, UNSCENTED, CENTRAL_DIFFERENCE = 0, 1, 2
 LOG_2PI = float(np.log(2.0 * np.pi))
 JITTER, RETRIES = 1e-14, 7  # added to the diagonal where the factorisation fails, times 100 at each retry
 SIZES = 13  # integers before the lists of positions
-
-helper = numba.njit(error_model="numpy")
 
 
 @helper
