@@ -92,13 +92,17 @@ def read_rows(folder: Path) -> list[Row]:
     return rows
 
 
-def read_board(folder: Path) -> Board:
+def read_board(folder: Path, suite: Suite | None = None) -> Board:
     """A suite's rows, each checked against its outcomes.
+
+    Args:
+        folder: Of the rows.
+        suite: Default: the one that the folder is called after.
 
     Raises:
         RefusedError: A row does not agree with its outcomes or its suite; it is named.
     """
-    suite, rows, outcomes = load_suite(folder.name), read_rows(folder), {}
+    suite, rows, outcomes = suite or load_suite(folder.name), read_rows(folder), {}
     plant = suite.build()
     for path, row in zip(row_files(folder), rows, strict=True):
         outcomes[row.diagnoser] = read_outcomes(path, row, plant)
