@@ -147,6 +147,11 @@ def page(board: Board) -> str:
     return "\n".join(parts)
 
 
+def framing(board: Board) -> list[Row]:
+    """The rows that frame a ranking: floor and ceilings."""
+    return [row for row in board.rows if row.diagnoser in FLOOR or ceiling(row)]
+
+
 def draw(board: Board, folder: Path) -> None:
     """Draw the pictures of a suite's page into a folder: the ranking, and what the best row confuses."""
     from fdi_gym import plots
@@ -156,9 +161,10 @@ def draw(board: Board, folder: Path) -> None:
         return
     folder.mkdir(parents=True, exist_ok=True)
     rows = RANKINGS["Isolation"][0](board.honest())
-    frame = [row for row in board.rows if row.diagnoser in FLOOR or ceiling(row)]
     drawn = board.drawn(rows)
-    plots.ranking(rows, frame, cliques(drawn)).savefig(folder / f"{board.suite.name}-ranking.png")
+    plots.ranking(rows, framing(board), cliques(drawn), board.suite.episodes).savefig(
+        folder / f"{board.suite.name}-ranking.png"
+    )
     labels = [label.name for label in board.plant.labels]
     plots.confusions(best, labels).savefig(folder / f"{board.suite.name}-confusion.png")
 
