@@ -65,10 +65,12 @@ def delay_curve(outcomes: Sequence[Outcome], kind: str, dt: float) -> Curve:
         np.array([0, *times[kept], time.max()]) * dt,
         [len(time), *watched.sum(axis=0)[kept], (time == time.max()).sum()],
     )
-    ends_ = [np.array([0.0, *a[kept], *(a[-1:] if len(a) else [0.0])]) for a in (share, low, high)]
     if not len(times):  # none has shown: as sure of that as the flights allow
-        ends_[2] = np.array([0.0, _around(np.zeros(1), np.zeros(1), np.array([len(set(of))]))[1][0]])
-    return Curve(x, *ends_, np.array(count))
+        share = low = np.zeros(1)
+        high = _around(share, np.zeros(1), np.array([len(set(of))]))[1]
+        return Curve(x, np.zeros(2), np.zeros(2), np.array([0.0, high[0]]), np.array(count))
+    share, low, high = (np.array([0.0, *line[kept], line[-1]]) for line in (share, low, high))
+    return Curve(x, share, low, high, np.array(count))
 
 
 def _around(share: Array, variance: Array, units: Array) -> tuple[Array, Array]:

@@ -132,7 +132,9 @@ class Canvas:
         self.figure.text(
             0.012, 1 - 0.2 / self.figure.get_figheight(), f"{plant.env_id}, t = {k * plant.dt:.1f} s", fontsize=9
         )
-        mark = {"color": SAID, "ls": "", "marker": "s", "ms": 5} if self.answer is not None else {"color": SAID}
+        mark: dict[str, Any] = {"color": SAID}
+        if self.answer is not None:
+            mark |= {"ls": "", "marker": "s", "ms": 5}
         handles = [
             shade_handle(),
             Line2D([], [], color=palette.INK, label="truth"),
