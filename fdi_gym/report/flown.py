@@ -8,7 +8,6 @@ where flights are many, 254, which are as many as a panel has pixels.
 from __future__ import annotations
 
 import base64
-import itertools
 import zlib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -162,13 +161,13 @@ def thin(values: Array, points: int) -> Array:
     if len(values) <= points:
         return values
     edges = np.linspace(0, len(values), points // 2 + 1).astype(int)
-    low = np.minimum.reduceat(np.where(np.isfinite(values), values, np.inf), edges[:-1])
-    high = np.maximum.reduceat(np.where(np.isfinite(values), values, -np.inf), edges[:-1])
-    found = np.empty(2 * len(low))
-    for j, (a, b) in enumerate(itertools.pairwise(edges)):
-        stretch = values[a:b]
-        rising = np.argmax(stretch == low[j]) <= np.argmax(stretch == high[j])
-        found[2 * j : 2 * j + 2] = (low[j], high[j]) if rising else (high[j], low[j])
+    first, k = edges[:-1], np.arange(len(values))
+    there = np.isfinite(values)
+    low = np.minimum.reduceat(np.where(there, values, np.inf), first)
+    high = np.maximum.reduceat(np.where(there, values, -np.inf), first)
+    stretch = np.repeat(np.arange(len(first)), np.diff(edges))
+    lowest, highest = (np.minimum.reduceat(np.where(values == end[stretch], k, len(k)), first) for end in (low, high))
+    found = np.where(lowest <= highest, (low, high), (high, low)).T.ravel()
     return np.where(np.isfinite(found), found, np.nan)
 
 
