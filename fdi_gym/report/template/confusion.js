@@ -23,7 +23,7 @@ function confusion() {
     });
     const asked = { per_sample: "samples", per_decision: "decisions" }[kind];
     return el("figure", null, el("figcaption", null, el("b", null, kind.replace("_", " ")), ` \u2013 true label down, declared across; n ${asked}`),
-      el("div", { class: "wide", tabindex: 0, role: "region", "aria-label": `Confusion matrix ${kind.replace("_", " ")}` }, el("table", { class: "matrix" }, el("thead", null, head), el("tbody", null, ...body))));
+      el("div", { class: "wide", tabindex: 0, role: "region", "aria-label": `Confusion matrix ${kind.replace("_", " ")}` }, el("table", { class: many ? "matrix many" : "matrix" }, el("thead", null, head), el("tbody", null, ...body))));
   }
   at("matrices").classList.toggle("two", data.labels.length <= 8);
   function draw() { at("matrices").replaceChildren(matrix("per_sample"), matrix("per_decision")); }

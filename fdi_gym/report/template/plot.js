@@ -10,7 +10,7 @@ function ticks(low, high, most) {
 function plot(node, { height, x, y, caption, xlabel = "", ylabel = "", names = null, left = null, right = 10, top = 8, columns = null, xticks = true, label }) {
   const width = Math.max(280, node.clientWidth || 600);
   left = left ?? (names ? 6.7 * Math.min(34, Math.max(...names.map((n) => n.length), 4)) + 12 : 52);
-  left = Math.min(left, 0.42 * width);
+  left = Math.min(left, 0.46 * width);
   const bottom = xticks ? (xlabel ? 34 : 20) : 6, w = width - left - right, h = height - top - bottom;
   const X = (v) => left + w * (v - x[0]) / (x[1] - x[0] || 1);
   const Y = (v) => names ? top + h * (v + 0.5) / names.length : top + h * (1 - (v - y[0]) / (y[1] - y[0] || 1));
@@ -20,9 +20,9 @@ function plot(node, { height, x, y, caption, xlabel = "", ylabel = "", names = n
   const under = sv("g", { "clip-path": `url(#${id})` }), inside = sv("g", { "clip-path": `url(#${id})` }), over = sv("g");
   root.append(under);
   if (names) {
-    const most = Math.floor((left - 8) / 6.7);
+    const most = Math.floor((left - 8) / 6.7); // letters; what is cut is the middle, since names differ at their ends
     names.forEach((name, i) => root.append(sv("text", { x: left - 6, y: Y(i) + 3.5, "text-anchor": "end" },
-      name.length > most ? sv("title", null, name) : null, name.length > most ? `${name.slice(0, most - 1)}\u2026` : name)));
+      name.length > most ? sv("title", null, name) : null, name.length > most ? `${name.slice(0, Math.ceil(most / 2) - 1)}\u2026${name.slice(-Math.floor(most / 2))}` : name)));
   } else {
     for (const v of ticks(y[0], y[1], Math.max(2, Math.floor(h / (h > 200 ? 48 : 26))))) {
       root.append(sv("path", { class: "grid", d: `M${left} ${Y(v)}H${left + w}` }),
