@@ -92,13 +92,17 @@ def read_rows(folder: Path) -> list[Row]:
     return rows
 
 
-def read_board(folder: Path) -> Board:
+def read_board(folder: Path, suite: Suite | None = None) -> Board:
     """A suite's rows, each checked against its outcomes.
+
+    Args:
+        folder: Of the rows.
+        suite: Default: the one that the folder is called after.
 
     Raises:
         RefusedError: A row does not agree with its outcomes or its suite; it is named.
     """
-    suite, rows, outcomes = load_suite(folder.name), read_rows(folder), {}
+    suite, rows, outcomes = suite or load_suite(folder.name), read_rows(folder), {}
     plant = suite.build()
     for path, row in zip(row_files(folder), rows, strict=True):
         outcomes[row.diagnoser] = read_outcomes(path, row, plant)
@@ -143,6 +147,11 @@ def page(board: Board) -> str:
     return "\n".join(parts)
 
 
+def framing(board: Board) -> list[Row]:
+    """The rows that frame a ranking: floor and ceilings."""
+    return [row for row in board.rows if row.diagnoser in FLOOR or ceiling(row)]
+
+
 def draw(board: Board, folder: Path) -> None:
     """Draw the pictures of a suite's page into a folder: the ranking, and what the best row confuses."""
     from fdi_gym import plots
@@ -152,9 +161,10 @@ def draw(board: Board, folder: Path) -> None:
         return
     folder.mkdir(parents=True, exist_ok=True)
     rows = RANKINGS["Isolation"][0](board.honest())
-    frame = [row for row in board.rows if row.diagnoser in FLOOR or ceiling(row)]
     drawn = board.drawn(rows)
-    plots.ranking(rows, frame, cliques(drawn)).savefig(folder / f"{board.suite.name}-ranking.png")
+    plots.ranking(rows, framing(board), cliques(drawn), board.suite.episodes).savefig(
+        folder / f"{board.suite.name}-ranking.png"
+    )
     labels = [label.name for label in board.plant.labels]
     plots.confusions(best, labels).savefig(folder / f"{board.suite.name}-confusion.png")
 

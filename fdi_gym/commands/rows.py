@@ -1,4 +1,4 @@
-"""Rows and their pages: evaluate, verify, leaderboard."""
+"""Rows: evaluate, verify."""
 
 from __future__ import annotations
 
@@ -101,21 +101,3 @@ def verify(
     for path in rows:
         episodes = check(path, share, seed=seed, suite=suite, trust=trust)
         print(f"{path}: every figure follows from the episodes; {len(episodes)} run again, same outcomes: {episodes}")
-
-
-def render(results: Path = Path("leaderboards/results"), pages: Path = Path("leaderboards"), pictures: bool = True) -> None:
-    """Render the tables of all rows: README.md, a page for each suite, and their pictures.
-
-    Args:
-        results: Folder of the rows.
-        pages: Folder of the pages.
-        pictures: Draw the pictures, too.
-    """
-    from fdi_gym import leaderboard
-    from fdi_gym.files import write_whole
-
-    for name, text in leaderboard.render(results).items():
-        write_whole(pages / name, text.encode())
-        print(pages / name)
-    for board in leaderboard.boards(results) if pictures else ():
-        leaderboard.draw(board, pages / "pictures")
