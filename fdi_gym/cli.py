@@ -8,11 +8,12 @@ from typing import Any
 
 import tyro
 
-from fdi_gym.commands import methods, rows, suites
+from fdi_gym.commands import methods, recordings, rows, suites
 
 COMMANDS: dict[str, Any] = {
     "evaluate": rows.evaluate, "verify": rows.verify, "leaderboard": rows.render, "list": suites.show,
     "freeze": suites.freeze, "fit": methods.fit, "train": methods.train,
+    "diagnose": recordings.diagnose, "collect": recordings.collect,
 }  # fmt: skip
 
 

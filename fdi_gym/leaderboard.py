@@ -10,7 +10,7 @@ from fdi_gym.files import RefusedError
 from fdi_gym.metrics import Outcome
 from fdi_gym.plant import Plant
 from fdi_gym.row import Row, read_made, read_outcomes, read_row, row_files
-from fdi_gym.suite import Suite, load_suite
+from fdi_gym.suite import AnySuite, load_suite
 from fdi_gym.tables import (
     FLOOR,
     RANKINGS,
@@ -60,7 +60,7 @@ times per sample on the machine of the run, in blocks of 100 flights.
 class Board(NamedTuple):
     """All that is on a suite's page."""
 
-    suite: Suite
+    suite: AnySuite
     plant: Plant
     rows: list[Row]
     outcomes: dict[str, list[Outcome]]

@@ -20,7 +20,8 @@ from fdi_gym.diagnosis.registry import GIVEN
 from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.faults import draw
 from fdi_gym.names import blamed, find_module, unknown
-from fdi_gym.suite import Suite, load_suite, suite_names
+from fdi_gym.recordings.suite import RecordedSuite
+from fdi_gym.suite import AnySuite, load_suite, suite_names
 
 
 def find_plant(text: str) -> tuple[str, str]:
@@ -95,7 +96,10 @@ def _outside(text: str, name: str) -> str:
     return _diagnoser(find_diagnoser(text))
 
 
-def _suite(suite: Suite) -> str:
+def _suite(suite: AnySuite) -> str:
+    if isinstance(suite, RecordedSuite):
+        lines = [f"{suite.name}: {suite.description}", "", f"  recorded     {suite.episodes} flights, {suite.env}"]
+        return "\n".join([*lines, f"  layout       {suite.layout}", f"  version      {suite.sha256[:12]}"])
     lines = [f"{suite.name}: {suite.description}", "", f"  environment  {suite.env}", f"  options      {suite.options}"]
     lines += [f"  process      {suite.process}", f"  mismatch     {suite.mismatch}"]
     seeds = [*suite.seeds, *suite.healthy]

@@ -163,6 +163,46 @@ def flight(plant: Plant, record: Record, said: dict[str, Any], i: int = 0, entri
     return figure
 
 
+def recording(plant: Plant, obs: Array, time: Array, label: Array | None, said: dict[str, Any]) -> Any:
+    """A figure of one recorded flight: its sensors, and what each of any number of methods declared when, as strips.
+
+    Args:
+        plant: The plant.
+        obs: Observations (K + 1, n_obs).
+        time: (K + 1,) s.
+        label: (K + 1,) true labels; None where they are not known.
+        said: Decisions (of one flight) by name of the method.
+    """
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
+    strips = ({} if label is None else {"truth": label}) | {name: one.label[0] for name, one in said.items()}
+    height = 0.6 + 0.17 * len(strips)
+    figure = Figure(figsize=(9.6, 3.0 + height), dpi=120, layout="constrained")
+    top, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [2.4, height]})
+    for j, signal in enumerate(plant.outputs):
+        top.plot(time, (obs[:, j] - signal.nominal) / signal.scale, lw=0.7, label=signal.name)
+    top.legend(loc="upper left", ncol=8, fontsize=6, frameon=False)
+    top.set_ylabel("sensors, scaled", fontsize=8)
+    top.spines[["top", "right"]].set_visible(False)
+    rows = np.array(list(strips.values()))
+    shades = np.vstack([[0.93, 0.93, 0.93, 1.0], colormaps["tab20"](np.arange(max(len(plant.labels) - 1, 1)) % 20)])
+    rows = np.where(rows < 0, len(shades), rows)
+    below.imshow(
+        rows, aspect="auto", interpolation="nearest", cmap=ListedColormap([*shades, (0, 0, 0, 1)]), vmin=-0.5,
+        vmax=len(shades) + 0.5, extent=(time[0], time[-1], len(rows) - 0.5, -0.5),
+    )  # fmt: skip
+    below.set_yticks(range(len(strips)), list(strips), fontsize=6)
+    below.set_xlabel("time, s")
+    seen = np.unique(rows)
+    names = [*(entry.name for entry in plant.labels), "lost"]
+    patches = [Patch(color=[*shades, (0, 0, 0, 1)][i], label=names[i]) for i in seen]
+    below.legend(handles=patches, loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=6, frameon=False)
+    return figure
+
+
 def method_signals(plant: Plant, record: Record, said: Any, i: int = 0) -> Any:
     """A figure of what a method shows of itself (`run(..., signals=True)`): residuals, thresholds, approximations.
 

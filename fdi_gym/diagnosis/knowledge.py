@@ -116,8 +116,14 @@ def _on_disk(entry: Entry, place: str, of: Any, make: Any) -> Any:
 
 
 def knowledge_of(entry: Entry, plant: Plant, process: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The belief and the calibration that a method's builder takes: shipped, or found now and kept for the session."""
+    """The belief and the calibration that a method's builder takes: shipped, or found now and kept for the session.
+
+    Raises:
+        NotApplicableError: It takes some, and the plant has no equations from which they could be found.
+    """
     found: dict[str, Any] = {}
+    if plant.kernels is None and (entry.takes("belief") or entry.takes("calibration")):
+        raise NotApplicableError(f"needs equations; {plant.id} declares channels only")
     if entry.takes("belief"):
         found["belief"] = _known(entry, plant, "beliefs", belief_key(plant, process), lambda: fit_belief(plant, process))
     if entry.takes("calibration"):
