@@ -165,7 +165,7 @@ def scored_samples(label: Array, length: int, scoring: Scoring) -> Array:
 
 
 def severity_bands(plant: Plant, label: Array, theta: Array) -> Array:
-    """Band index (K + 1,) of each sample by the size of its smallest active fault; -1 where healthy or theta is not known."""
+    """Band index (K + 1,) of each sample by the size of its smallest active fault; -1 where healthy or not known."""
     band = np.full(len(label), -1)
     modes = {mode.name: mode for mode in plant.modes}
     for index in np.unique(label[label > 0]):

@@ -72,7 +72,7 @@ class Plant(Truth):
         dt: Sample time [s].
         substeps: Runge-Kutta steps per sample; 0 for a discrete plant, whose dynamics kernel gives the next state.
         linear: The dynamics are linear in x, and bilinear in (u, theta).
-        kernels: The compiled equations; None for a plant of which only channels are known, that no model-based method runs on.
+        kernels: The compiled equations; None where only channels are known: no model-based method runs.
         states, outputs, commands, known, disturbances: Data sheets of the vectors, in order.
         theta: Data sheet of the fault parameter; `nominal` is the healthy value.
         estimated: Data sheet of what the identification task asks for. Default: theta itself.

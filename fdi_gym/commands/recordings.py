@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from fdi_gym.commands.arguments import Names, PlantName, SuiteName
+from fdi_gym.commands.arguments import Names, PlantName
 
 
 def diagnose(
@@ -25,8 +25,8 @@ def diagnose(
     """Show recorded flights to diagnosers: say what happened when, and write their decisions and a picture.
 
     Args:
-        flight: A CSV or Parquet file, or a folder of them. A row is a sample; a command is that of the interval that has just
-            ended.
+        flight: A CSV or Parquet file, or a folder of them. A row is a sample; its commands are those of the interval that
+            has just ended.
         plant: Plant or environment id; "module:id" where the module registers it.
         diagnosers: Names; "all" for every one that can run on the plant and is told nothing of the truth.
         mapping: A file that says which column is what; without it columns are called as the plant's channels.

@@ -103,19 +103,25 @@ def verify(
         print(f"{path}: every figure follows from the episodes; {len(episodes)} run again, same outcomes: {episodes}")
 
 
-def render(results: Path = Path("leaderboards/results"), pages: Path = Path("leaderboards"), pictures: bool = True) -> None:
+def render(
+    results: Path = Path("leaderboards/results"),
+    pages: Path = Path("leaderboards"),
+    pictures: bool = True,
+    suites: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SUITE")] = (),
+) -> None:
     """Render the tables of all rows: README.md, a page for each suite, and their pictures.
 
     Args:
         results: Folder of the rows.
         pages: Folder of the pages.
         pictures: Draw the pictures, too.
+        suites: Paths of suites, or "module:name", that are not installed.
     """
     from fdi_gym import leaderboard
     from fdi_gym.files import write_whole
 
-    for name, text in leaderboard.render(results).items():
+    for name, text in leaderboard.render(results, suites).items():
         write_whole(pages / name, text.encode())
         print(pages / name)
-    for board in leaderboard.boards(results) if pictures else ():
+    for board in leaderboard.boards(results, suites) if pictures else ():
         leaderboard.draw(board, pages / "pictures")

@@ -4,8 +4,8 @@
     said = run(make_diagnoser("augmented_ekf", plant), recording.obs[None])
 
 `observations` finds the plant's channels among the columns, brings them to the plant's units and samples, and says what it
-mended; `doubts` says what else may be wrong. `to_frame` is the way back. They are functions and no methods of `Plant` and `Record`, since those
-lie below files, clocks and units. Nothing that is read here is executed.
+mended; `doubts` says what else may be wrong. `to_frame` is the way back. They are functions and no methods of `Plant` and
+`Record`, since those lie below files, clocks and units. Nothing that is read here is executed.
 """
 
 from fdi_gym.recordings.columns import to_frame, write_table

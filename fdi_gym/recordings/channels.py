@@ -69,7 +69,8 @@ def channels_plant(plant_id: str, channels: Channels) -> Plant:
     """
     n = len(channels.labels)
     modes = tuple(
-        FaultMode(name, "as labelled", _unknown, (1.0, 1.0), offset=tuple(np.eye(n)[i]), direction=(0.0,) * n, reach=(0.0, 0.0))
+        FaultMode(name, "as labelled", _unknown, (1.0, 1.0),
+                  offset=tuple(np.eye(n)[i]), direction=(0.0,) * n, reach=(0.0, 0.0))
         for i, name in enumerate(channels.labels)
     )  # fmt: skip
     recorded = FaultProcess(

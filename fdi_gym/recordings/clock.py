@@ -39,7 +39,7 @@ def seconds(values: Array, unit: str | None, what: str) -> tuple[Array, Array]:
     filled = text[text != ""]
     if filled.size and _DATE.match(str(filled[0])):
         found = np.full(len(text), np.nan)
-        for i, date in enumerate(text):
+        for date in text:
             if date and not _DATE.fullmatch(str(date).removesuffix("Z").removesuffix("+00:00")):
                 raise RefusedError(f"{what}: a date is as in '2026-03-09 10:14:33.25', not {str(date)[:80]!r}")
         dates = [
@@ -49,6 +49,8 @@ def seconds(values: Array, unit: str | None, what: str) -> tuple[Array, Array]:
         there = ~np.isnat(stamps)
         found[there] = (stamps[there] - stamps[there][0]).astype(np.int64) * 1e-9
         return found, stamps.astype(np.int64).astype(float) * 1e-9
+    if not np.char.count(text, ".").any():
+        text = np.char.replace(text, ",", ".")  # a decimal comma
     try:
         numbers = np.where(text == "", "nan", text).astype(float)
     except ValueError:

@@ -243,7 +243,8 @@ def _label(
         fault = 1
     else:
         raise RefusedError(f"{table.source}: which fault began is in no column; {plant.id} has {len(plant.labels) - 1}")
-    label[(at.samples > begin) & (at.samples <= (np.inf if end is None else end))] = fault
+    ends = at.samples - 1e-6 * plant.dt  # of intervals, a rounding error earlier
+    label[(ends > begin) & (ends <= (np.inf if end is None else end))] = fault
     return label
 
 

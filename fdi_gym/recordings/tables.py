@@ -28,7 +28,7 @@ SEPARATORS = ",;\t|"
 MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
 SUFFIXES = (".csv", ".parquet", ".txt", ".tsv", ".dat")
 
-_UNIT = re.compile(r"^(?P<name>.*\S)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
+_UNIT = re.compile(r"^(?P<name>.*\S)\s*\[(?P<unit>[^\[\]]*)\]$")
 _COMMA = re.compile(r"^\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*$")
 
 
@@ -191,9 +191,9 @@ def _text(path: Path, header: bool, separator: str | None) -> Table:
                 raise RefusedError(f"{path}: line {number} has {len(cells)} cells, the first one has {len(names)}")
             held.append(cells)
             at.append(number)
-            count += 1
-            if count > ROWS:
+            if count == ROWS:
                 raise RefusedError(f"{path} has more than {ROWS} rows")
+            count += 1
             if len(held) == PIECE:
                 finish()
         finish()
