@@ -13,7 +13,7 @@ from fdi_gym.commands import methods, recordings, rows, suites
 COMMANDS: dict[str, Any] = {
     "evaluate": rows.evaluate, "verify": rows.verify, "leaderboard": rows.render, "list": suites.show,
     "freeze": suites.freeze, "fit": methods.fit, "train": methods.train,
-    "diagnose": recordings.diagnose, "collect": recordings.collect,
+    "diagnose": recordings.diagnose, "collect": recordings.collect, "export": recordings.export,
 }  # fmt: skip
 
 

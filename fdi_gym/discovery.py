@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fdi_gym.checks import is_whole, unknown
+from fdi_gym.names import find_module
 from fdi_gym.plant import Plant
 
 _FOLDER = Path(__file__).parent / "plants"
@@ -73,12 +74,15 @@ def add_plant_source(plant_id: str, source: PlantSource) -> None:
 
 
 def load_plant(plant_id: str, **options: Any) -> Plant:
-    """Build a plant by id with the options of its data sheet.
+    """Build a plant by id with the options of its data sheet; "module:id" where importing the module registers it.
 
     Raises:
         ValueError: Unknown plant, option or option value (the message lists those that exist), or a builder that does
             not build the plant it is registered for.
     """
+    if isinstance(plant_id, str) and ":" in plant_id:
+        module, _, plant_id = plant_id.rpartition(":")
+        find_module(module)
     sources = plant_sources()
     if not isinstance(plant_id, str) or plant_id not in sources:
         raise ValueError(unknown("plant", plant_id, sources))

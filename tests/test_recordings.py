@@ -359,7 +359,7 @@ MAPPINGS = [
     ('{"channels": {"p": {"column": "x", "factor": "2"}}}', "factor"), ('{"commands": "u"}', "Invalid enum value"),
     ('{"time": {"column": "t", "unit": "days"}}', "Invalid enum value"), ('{"channels": {"p": {"column": "x", "factor": 1e400}}}', "out of range|factor"),
     ('{"channels": {"p": {"factor": 2}}}', "missing required field `column`"), ('{"label": "a", "onset": "b"}', "not by both"),
-    ("[" * 100_000, "nested too deeply"), ('{"not_recorded": [""]}', "length >= 1"),
+    ("[" * 100_000, "Expected `object`"), ('{"not_recorded": [""]}', "length >= 1"),
 ]  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from fdi_gym.commands.arguments import Names, PlantName
+from fdi_gym.commands.arguments import Names, PlantName, SuiteName
 
 
 def diagnose(
@@ -177,3 +177,28 @@ def collect(
             mapping=columns,
         )
     )
+
+
+def export(
+    suite: SuiteName,
+    format: Literal["parquet", "minari"] = "parquet",
+    output: Path = Path("export"),
+    jobs: int = -1,
+) -> None:
+    """Write a suite's flights as files for others, truth included; an export that was killed goes on.
+
+    Args:
+        suite: Name of a suite, or path of a suite file.
+        format: Parquet files with a Croissant description, or a data set of Minari.
+        output: Folder of exports; for Minari, what MINARI_DATASETS_PATH is set to.
+        jobs: Worker processes for Parquet, -1 for one per core.
+    """
+    from fdi_gym import export as to
+    from fdi_gym.suite import load_suite
+
+    frozen = load_suite(suite)
+    if format == "parquet":
+        print(to.parquet(frozen, output, jobs))
+    else:
+        folder = to.minari(frozen, output)
+        print(f'{folder}: MINARI_DATASETS_PATH={output}, minari.load_dataset("{folder.relative_to(output).as_posix()}")')
