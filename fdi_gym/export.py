@@ -318,5 +318,5 @@ def _episodes(suite: Any, plant: Plant, episodes: range) -> Iterator[Any]:
         yield EpisodeBuffer(
             id=episode, seed=int(seeds[episode * suite.windows]), observations=record.obs[i, : K + 1], actions=label[:K],
             rewards=worth, terminations=last & record.terminated[i], truncations=last & ~record.terminated[i],
-            infos={"label": label, "target": record.target[i, : K + 1], "theta": record.theta[i, : K + 1]},
+            infos={"label": label.tolist(), "target": record.target[i, : K + 1], "theta": record.theta[i, : K + 1]},
         )  # fmt: skip
