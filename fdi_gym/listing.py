@@ -34,12 +34,23 @@ def find_plant(text: str) -> tuple[str, str]:
         ValueError: There is none.
     """
     module, _, name = text.rpartition(":")
+    found = as_plant(text)
+    if found is None:
+        raise unknown("plant", name, plant_sources())
+    return module, found
+
+
+def as_plant(text: str) -> str | None:
+    """The id of the plant that a plant or environment id names, "module:id" too; None where it names none.
+
+    Raises:
+        ValueError: The module before a ":" cannot be imported.
+    """
+    module, _, name = text.rpartition(":")
     if module:
         find_module(module)
     ids = {f"{plant}-Faults-v{source.version}": plant for plant, source in plant_sources().items()}
-    if name not in ids and name not in ids.values():
-        raise unknown("plant", name, ids.values())
-    return module, ids.get(name, name)
+    return name if name in ids.values() else ids.get(name)
 
 
 def overview() -> str:
