@@ -1,5 +1,5 @@
-"""How plants are found: a file in `fdi_gym/plants/` with an `ID` line, an entry point of the group "fdi_gym.plants" (its name
-is the environment's, its value the builder's "module:function"), or whatever `fdi_gym.register_plant` made known.
+"""How plants are found: a file in `fdi_gym/plants/` with an `ID` line, an entry point of the group "fdi_gym.plants" (its
+name is the environment's, its value the builder's "module:function"), or whatever `fdi_gym.register_plant` made known.
 
 Nothing is listed, and nothing is imported to list them. `load_plant` builds one by its id.
 """

@@ -150,7 +150,8 @@ def _plant(suite: AnySuite) -> Plant:
 _CONTEXT = {
     "@language": "en", "@vocab": "https://schema.org/", "sc": "https://schema.org/", "cr": "http://mlcommons.org/croissant/",
     "dct": "http://purl.org/dc/terms/", "conformsTo": "dct:conformsTo", "column": "cr:column", "recordSet": "cr:recordSet",
-    "field": "cr:field", "fileObject": "cr:fileObject", "fileSet": "cr:fileSet", "source": "cr:source", "extract": "cr:extract",
+    "field": "cr:field", "fileObject": "cr:fileObject", "fileSet": "cr:fileSet", "source": "cr:source",
+    "extract": "cr:extract",
     "includes": "cr:includes", "dataType": {"@id": "cr:dataType", "@type": "@vocab"}, "key": "cr:key", "md5": "cr:md5",
     "citeAs": "cr:citeAs", "isLiveDataset": "cr:isLiveDataset", "references": "cr:references", "repeated": "cr:repeated",
     "regex": "cr:regex", "replace": "cr:replace", "separator": "cr:separator", "subField": "cr:subField",
@@ -182,7 +183,8 @@ def croissant(suite: AnySuite, plant: Plant, parts: list[Path]) -> dict[str, Any
         "description": f"{suite.description}. {suite.episodes} flights of {suite.env}, process {suite.process}, "
                        f"suite version {suite.sha256}.",
         "version": fdi_gym.__version__, "license": "https://spdx.org/licenses/MIT", "url": "https://github.com/fdi-gym/fdi_gym",
-        "distribution": [*files, {"@type": "cr:FileSet", "@id": "parts", "name": "parts", "includes": f"{suite.name}/part-*.parquet",
+        "distribution": [*files, {"@type": "cr:FileSet", "@id": "parts", "name": "parts",
+                                  "includes": f"{suite.name}/part-*.parquet",
                                   "encodingFormat": "application/x-parquet",
                                   "containedIn": [{"@id": path.name} for path in parts]}],
         "recordSet": [{"@type": "cr:RecordSet", "@id": "samples", "name": "samples", "field": fields,
@@ -253,7 +255,8 @@ def minari(suite: AnySuite, output: Path, progress: bool = True) -> Path:
             create_namespace("fdi_gym")
         storage = MinariStorage.new(folder, env_spec=environment(suite, plant), data_format="parquet")
         storage.update_metadata({
-            "dataset_id": name, "description": suite.description, "algorithm_name": "the truth", "minari_version": _version(),
+            "dataset_id": name, "description": suite.description, "algorithm_name": "the truth",
+            "minari_version": _version(),
             "requirements": [f"fdi-gym=={fdi_gym.__version__}"], "suite_sha256": suite.sha256,
         })  # fmt: skip
     size, storage.get_size = storage.get_size, lambda: 0.0  # type: ignore[method-assign]  # asks for all files, at each flight

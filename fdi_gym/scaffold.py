@@ -70,7 +70,8 @@ def new(kind: Literal["plant", "diagnoser"], folder: Path) -> list[Path]:
     words = {
         "IMPORTS": "\n".join(f"from fdi_gym.{line}" for line in imports),
         "ENTRY_POINTS": f'{points}\n\n[project.entry-points."fdi_gym.suites"]\n{name} = "{name}.suites"',
-        "CONFORMS": conforms, "IDENTIFIER": identifier, "DISTRIBUTION": name.replace("_", "-"), "PACKAGE": name, "BENCH": bench,
+        "CONFORMS": conforms, "IDENTIFIER": identifier, "DISTRIBUTION": name.replace("_", "-"), "PACKAGE": name,
+        "BENCH": bench,
         "METHOD": method, "KIND": f"A {kind}", "WHAT": identifier if kind == "plant" else name,
         "PLANT": "plant" if kind == "plant" else "method",
     }  # fmt: skip
@@ -112,7 +113,8 @@ def _make_row(folder: Path, name: str, bench: str, plant_id: str, methods: list[
     """Freeze the suite, evaluate it and render its board."""
     built = plant_sources()[plant_id]
     suite = Suite(
-        name=bench, description=f"{FLIGHTS} flights of {plant_id}", env=f"{plant_id}-Faults-v{built.version}", plant=plant_id,
+        name=bench, description=f"{FLIGHTS} flights of {plant_id}", env=f"{plant_id}-Faults-v{built.version}",
+        plant=plant_id,
         options={}, process="standard", mismatch=None, seeds=list(range(FIRST_SEED, FIRST_SEED + FLIGHTS)), settings={},
     ).sealed()  # fmt: skip
     path = freeze(suite, folder / name / "suites")

@@ -58,8 +58,8 @@ def test_a_row_is_a_sample_and_the_columns_are_the_flights(suite, tmp_path, in_b
         mine = episode == i
         for j, name in enumerate(channel_columns(plant)):
             assert np.array_equal(table[name].to_numpy()[mine], record.obs[i, :, j])
-        for j, signal in enumerate(plant.theta):
-            assert np.array_equal(table[f"theta: {signal.name}"].to_numpy()[mine], record.theta[i, :, j])
+        for j, entry in enumerate(plant.theta):
+            assert np.array_equal(table[f"theta: {entry.name}"].to_numpy()[mine], record.theta[i, :, j])
         assert [plant.labels[k].name for k in record.label[i]] == [
             v for v, m in zip(table["label"].to_pylist(), mine, strict=True) if m
         ]
@@ -178,8 +178,8 @@ import dc_motor
 from fdi_gym import export
 from fdi_gym.suite import Suite
 n = int(sys.argv[1])
-suite = Suite(name=f"n{n}", description="", env="dc_motor:DCMotor-Faults-v0", plant="DCMotor", options={}, process="standard",
-              mismatch=None, seeds=list(range(n)), settings={}).sealed()
+suite = Suite(name=f"n{n}", description="", env="dc_motor:DCMotor-Faults-v0", plant="DCMotor", options={},
+              process="standard", mismatch=None, seeds=list(range(n)), settings={}).sealed()
 export.parquet(suite, pathlib.Path(sys.argv[2]), jobs=1, progress=False)
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """

@@ -72,14 +72,14 @@ def test_the_row_of_a_new_package_is_verified_and_its_board_rendered(made, name,
     place, call = made
     bench = f"{name.replace('_', '-')}-bench"
     rows = place / name / "results" / bench
-    code, out, err = call("verify", rows / f"{method}.json", rows / "null.json", cwd=place / name)
+    code, _, err = call("verify", rows / f"{method}.json", rows / "null.json", cwd=place / name)
     assert code == 0, err
     before = {path.name: path.read_bytes() for path in (place / name / "boards").glob("*.md")}
     assert f"{bench}.md" in before
     code, out, err = call("leaderboard", "--results", "results", "--pages", "boards", "--no-pictures", cwd=place / name)
     assert code == 0, err
     assert {path.name: path.read_bytes() for path in (place / name / "boards").glob("*.md")} == before
-    code, out, err = call("evaluate", f"{name}.suites:{bench}", "--diagnosers", "null", "--episodes", 3, "--jobs", 1)
+    code, _, err = call("evaluate", f"{name}.suites:{bench}", "--diagnosers", "null", "--episodes", 3, "--jobs", 1)
     assert code == 0, err
 
 
@@ -91,7 +91,8 @@ def test_the_tests_of_a_new_package_pass(made, name):
 
 
 @pytest.mark.parametrize(("name", "words"), [
-    ("json", "is called by up to"), ("B", "is called by up to"), ("9x", "is called by up to"), ("class", "is called by up to"),
+    ("json", "is called by up to"), ("B", "is called by up to"), ("9x", "is called by up to"),
+    ("class", "is called by up to"),
     ("msgspec", "is a module msgspec already"), ("b747lateral", ""),
 ])  # fmt: skip
 def test_a_name_that_cannot_be_is_refused(capsys, tmp_path, name, words):
@@ -107,7 +108,8 @@ def test_what_does_not_keep_the_contract_is_said(capsys, tmp_path, monkeypatch):
     (tmp_path / "peeking.py").write_text(
         "import numpy as np\nfrom fdi_gym.diagnosis import Diagnoser, Diagnosis\n"
         "def build(plant):\n    rng = np.random.default_rng()\n"
-        "    def update(state, obs):\n        alarm = rng.random(len(obs)) < 0.5\n        return state, Diagnosis(alarm, alarm.astype(int))\n"
+        "    def update(state, obs):\n        alarm = rng.random(len(obs)) < 0.5\n        "
+        "return state, Diagnosis(alarm, alarm.astype(int))\n"
         "    return Diagnoser(lambda n: 0, update, gaps=True)\n"
     )
     monkeypatch.chdir(tmp_path)
@@ -121,7 +123,8 @@ def test_an_entry_point_that_is_no_plant_harms_nothing(monkeypatch):
     from importlib.metadata import EntryPoint
 
     points = [EntryPoint(name, value, "fdi_gym.plants") for name, value in (
-        ("Nothing", "a:b"), ("X-Faults-v0", "not a builder"), ("B747Lateral-Faults-v0", "evil:plant"), ("Y-Faults-v3", "nowhere:plant"),
+        ("Nothing", "a:b"), ("X-Faults-v0", "not a builder"), ("B747Lateral-Faults-v0", "evil:plant"),
+        ("Y-Faults-v3", "nowhere:plant"),
     )]  # fmt: skip
     monkeypatch.setattr(discovery, "entry_points", lambda group: points)
     discovery._entry_point_sources.cache_clear()

@@ -1,4 +1,4 @@
-"""Recordings: what is read is what was flown, what is wrong is said in words, and recorded flights are scored as flown ones."""
+"""Recordings: what is read is what was flown, what is wrong is said, and recorded flights are scored as flown ones."""
 
 import csv
 import json
@@ -240,7 +240,8 @@ def column_is(name, value):
 WRONG = [
     (lambda f: {k: v for k, v in f.items() if k not in ("p", "rudder")}, Mapping(), "no column for p, rudder"),
     (column_is("beta", "much"), Mapping(), "not numbers"),
-    (lambda f: {**f, **dict.fromkeys(("beta", "p", "r", "phi"), np.full(len(f["time"]), np.nan))}, Mapping(), "no value of any sensor"),
+    (lambda f: {**f, **dict.fromkeys(("beta", "p", "r", "phi"), np.full(len(f["time"]), np.nan))}, Mapping(),
+     "no value of any sensor"),
     (lambda f: {**f, "time": np.full(len(f["time"]), np.nan)}, Mapping(), "rows have no time"),
     (column_is("time", 3.0), Mapping(), "at least two rows"), (column_is("time", "noon"), Mapping(), "a number or a date"),
     (lambda f: rows(f, slice(0, 0)), Mapping(), "no rows"), (lambda f: rows(f, slice(0, 1)), Mapping(), "at least two rows"),
@@ -249,12 +250,15 @@ WRONG = [
     (lambda f: {**f, "time": np.r_[f["time"][:-1], 1e12]}, Mapping(), "more than 1000000 samples"),
     (lambda f: {**f, "p": f["p"][:-3]}, Mapping(), "differ in length"),
     (lambda f: {**f, "p": np.zeros((len(f["time"]), 2))}, Mapping(), "one column"),
-    (lambda f: f, Mapping(channels={"bta": "beta"}), "did you mean 'beta'"), (lambda f: f, Mapping(time="tme"), "did you mean 'time'"),
-    (lambda f: f, Mapping(channels={"beta": "bta"}), "did you mean 'beta'"), (lambda f: f, Mapping(label="lable"), "did you mean 'label'"),
+    (lambda f: f, Mapping(channels={"bta": "beta"}), "did you mean 'beta'"),
+    (lambda f: f, Mapping(time="tme"), "did you mean 'time'"),
+    (lambda f: f, Mapping(channels={"beta": "bta"}), "did you mean 'beta'"),
+    (lambda f: f, Mapping(label="lable"), "did you mean 'label'"),
     (lambda f: f, Mapping(not_recorded=["q"]), "unknown channel 'q'"),
     (lambda f: f, Mapping(channels={"beta": Column("beta", unit="kg")}), "nothing is known of how one is made"),
     (lambda f: f, Mapping(channels={"beta": Column("beta", unit="rad", factor=2.0)}), "a unit or a factor"),
-    (column_is("label", "broken"), Mapping(), "unknown label 'broken'"), (column_is("label", "77"), Mapping(), "unknown label '77'"),
+    (column_is("label", "broken"), Mapping(), "unknown label 'broken'"),
+    (column_is("label", "77"), Mapping(), "unknown label '77'"),
     (column_is("begins", 7), Mapping(onset="begins"), "which fault began is in no column"),
     (lambda f: {**f, "begins": f["time"]}, Mapping(onset="begins"), "one time for the flight"),
     (lambda f: {**f, "p ": f["p"]}, Mapping(), "two columns called 'p'"), (lambda f: {}, Mapping(), "no columns"),
@@ -271,11 +275,15 @@ def test_what_cannot_be_used_is_refused_in_words(flight, change, mapping, words)
 
 HEAD = "time,current,speed,voltage\n"
 TEXTS = [
-    ("", "is empty"), ("time\n1\n2\n", "has one column, 'time'"), (HEAD + "1,2,3\n", "line 2 has 3 cells, the first one has 4"),
+    ("", "is empty"), ("time\n1\n2\n", "has one column, 'time'"),
+    (HEAD + "1,2,3\n", "line 2 has 3 cells, the first one has 4"),
     (HEAD + "0,1,much,1\n", "line 2: speed is a number, not 'much'"), ("a,a\n1,2\n", "two columns called 'a'"),
-    ("time,current,speed,voltage\n", "has no rows"), (HEAD + '"1,2\n' + "x" * 200_000 + "\n", "field larger than field limit"),
-    (HEAD + "1\0,2,3,4\n", "zero byte"), (HEAD + "1" * 2_000_000, "1048576 characters or more"), (b"\xff\xfea\0,\0b\0\n\0", "not text"),
-    ("time,current,speed,voltage\n" + "0,1,1,1\n" * 3, "at least two rows"), (",".join(map(str, range(20_000))) + "\n1", "up to 10000"),
+    ("time,current,speed,voltage\n", "has no rows"),
+    (HEAD + '"1,2\n' + "x" * 200_000 + "\n", "field larger than field limit"),
+    (HEAD + "1\0,2,3,4\n", "zero byte"), (HEAD + "1" * 2_000_000, "1048576 characters or more"),
+    (b"\xff\xfea\0,\0b\0\n\0", "not text"),
+    ("time,current,speed,voltage\n" + "0,1,1,1\n" * 3, "at least two rows"),
+    (",".join(map(str, range(20_000))) + "\n1", "up to 10000"),
 ]  # fmt: skip
 
 
@@ -307,7 +315,7 @@ def test_parquet_that_is_none_or_holds_something_else_is_refused(motor, tmp_path
         observations(motor, path)
     base = {name: np.arange(3.0) / 100 for name in ("time", "current", "voltage")}
     pq.write_table(pa.table({**base, "speed": [[1.0], [2.0], []]}), path)
-    with pytest.raises(RefusedError, match="speed holds list<.*not numbers"):
+    with pytest.raises(RefusedError, match=r"speed holds list<.*not numbers"):
         observations(motor, path)
     pq.write_table(pa.table({**base, "speed": ["a", "b", "c"]}), path)
     with pytest.raises(RefusedError, match="speed holds string, not numbers"):
@@ -317,7 +325,7 @@ def test_parquet_that_is_none_or_holds_something_else_is_refused(motor, tmp_path
     content = bytearray(path.read_bytes())
     content[8:60] = bytes(52)
     path.write_bytes(content)
-    with pytest.raises(RefusedError, match="cannot be read|is not a Parquet file|differ in length|no value"):
+    with pytest.raises(RefusedError, match=r"cannot be read|is not a Parquet file|differ in length|no value"):
         observations(motor, path)
     path.write_bytes(whole[:-20])
     with pytest.raises(RefusedError, match="is not a Parquet file"):
@@ -355,10 +363,13 @@ def test_more_rows_than_a_flight_has_are_refused(motor, tmp_path, monkeypatch):
 
 
 MAPPINGS = [
-    ("[]", "object"), ("{", "not a mapping"), ('{"chanels": {}}', "unknown field `chanels`"), ('{"channels": {"p": 3}}', "channels"),
+    ("[]", "object"), ("{", "not a mapping"), ('{"chanels": {}}', "unknown field `chanels`"),
+    ('{"channels": {"p": 3}}', "channels"),
     ('{"channels": {"p": {"column": "x", "factor": "2"}}}', "factor"), ('{"commands": "u"}', "Invalid enum value"),
-    ('{"time": {"column": "t", "unit": "days"}}', "Invalid enum value"), ('{"channels": {"p": {"column": "x", "factor": 1e400}}}', "out of range|factor"),
-    ('{"channels": {"p": {"factor": 2}}}', "missing required field `column`"), ('{"label": "a", "onset": "b"}', "not by both"),
+    ('{"time": {"column": "t", "unit": "days"}}', "Invalid enum value"),
+    ('{"channels": {"p": {"column": "x", "factor": 1e400}}}', "out of range|factor"),
+    ('{"channels": {"p": {"factor": 2}}}', "missing required field `column`"),
+    ('{"label": "a", "onset": "b"}', "not by both"),
     ("[" * 100_000, "Expected `object`"), ('{"not_recorded": [""]}', "length >= 1"),
 ]  # fmt: skip
 
@@ -387,7 +398,8 @@ def test_labels_onsets_and_indices_say_the_same(flight):
         "words of one's own": ({**bare, "state": np.where(truth > 0, "kaputt", "ok")},
                                Mapping(label=Labels("state", {"kaputt": fault, "ok": "none"}))),
         "onset": ({**bare, "onset": np.full(n, onset), "fault": np.full(n, fault)}, Mapping()),
-        "mapped onset": ({**bare, "t0": np.full(n, onset), "what": np.full(n, "x")}, Mapping(onset=Onset("t0", None, "what", {"x": fault}))),
+        "mapped onset": ({**bare, "t0": np.full(n, onset), "what": np.full(n, "x")},
+                         Mapping(onset=Onset("t0", None, "what", {"x": fault}))),
     }  # fmt: skip
     for how, (table, mapping) in ways.items():
         assert np.array_equal(observations(plant, table, mapping).label, truth), how
@@ -438,7 +450,8 @@ def test_a_recorded_suite_gets_rows_that_are_verified_and_rendered(capsys, recor
     _, _, path = recorded
     results, pages = tmp_path / "results", tmp_path / "pages"
     pages.mkdir()
-    code, out, err = said(capsys, "evaluate", path, "--diagnosers", "null", "augmented_ekf", "known_onset_oracle", "--results", results,
+    code, out, err = said(capsys, "evaluate", path, "--diagnosers", "null", "augmented_ekf", "known_onset_oracle",
+                          "--results", results,
                           "--work", tmp_path / "work", "--jobs", "1")  # fmt: skip
     assert code == 0, err
     assert "motors on a bench" in out
@@ -460,7 +473,8 @@ def test_a_recording_that_was_changed_is_another(recorded, tmp_path, capsys):
         capsys, "evaluate", path, "--diagnosers", "null", "--work", tmp_path / "w"
     )
     text = json.loads(path.read_text())
-    for change, words in (({"description": "another"}, "was edited"), ({"flights": {"../x.csv": "0" * 64}}, "lie in the folder"),
+    for change, words in (({"description": "another"}, "was edited"),
+    ({"flights": {"../x.csv": "0" * 64}}, "lie in the folder"),
                           ({"flights": {"/etc/passwd": "0" * 64}}, "lie in the folder"), ({"more": 1}, "unknown field"),
                           ({"flights": {}}, "from 1 to"), ({"folder": "/etc"}, "says where it lies")):  # fmt: skip
         path.write_text(json.dumps({**text, **change}))
@@ -536,7 +550,8 @@ def away(tmp_path, monkeypatch):
 
 def scored(capsys, away, path):
     """The row of the method above on a recorded suite, verified."""
-    code, _, err = said(capsys, "evaluate", path, "--diagnosers", "deviation:build", "null", "augmented_ekf", "--results", "results",
+    code, _, err = said(capsys, "evaluate", path, "--diagnosers", "deviation:build", "null", "augmented_ekf",
+                        "--results", "results",
                         "--work", "work", "--jobs", "1")  # fmt: skip
     assert code == 0, err
     assert "augmented_ekf: not applicable: needs equations" in err
@@ -563,7 +578,7 @@ def write_skab(folder, rng, skip=()):
 
 def test_the_layout_of_skab(capsys, away):
     write_skab(away / "skab", np.random.default_rng(0), skip=range(90, 96))
-    code, out, err = said(
+    code, _, err = said(
         capsys, "collect", "skab-small", "skab", "--plant", "SKAB", "--layout", "skab", "--description", "a test"
     )
     assert code == 0, err
@@ -652,7 +667,8 @@ def test_folders_without_what_a_layout_wants_are_refused(capsys, tmp_path):
 def test_a_flight_is_diagnosed_by_one_command(capsys, flight, tmp_path):
     plant, record, frame = flight
     write_table(tmp_path / "flight.csv", frame, units_of(plant))
-    code, out, err = said(capsys, "diagnose", tmp_path / "flight.csv", "--plant", "B747Lateral", "--diagnosers", "bayes_bank",
+    code, out, err = said(capsys, "diagnose", tmp_path / "flight.csv", "--plant", "B747Lateral", "--diagnosers",
+                          "bayes_bank",
                           "two_stage_kf_exponential", "mekf", "--output", tmp_path / "out")  # fmt: skip
     assert code == 0, err
     assert "mekf: not applicable" in err
@@ -670,7 +686,7 @@ def test_a_flight_is_diagnosed_by_one_command(capsys, flight, tmp_path):
 
 
 def test_of_a_folder_what_is_broken_is_refused_and_the_rest_diagnosed(capsys, flight, tmp_path):
-    plant, _, frame = flight
+    _, _, frame = flight
     write_table(tmp_path / "b.csv", rows(frame, slice(0, 200)), {})
     (tmp_path / "a.csv").write_text("time,nothing\n1,2\n")
     code, out, err = said(

@@ -133,7 +133,8 @@ def clock(t: Array, dt: float, what: str) -> Clock:
     if gaps.any():
         longest = float(np.diff(t).max())
         notes.append(
-            f"{int(gaps.sum())} gaps, the longest {longest:.6g} s: {int((~near).sum())} of {len(samples)} samples are missing"
+            f"{int(gaps.sum())} gaps, the longest {longest:.6g} s: "
+            f"{int((~near).sum())} of {len(samples)} samples are missing"
         )
     if ratio > 0.75 and fits and (unused := len(t) - len(np.unique(nearest[near]))) > 0:
         notes.append(f"{unused} rows lie between samples and are left out")
@@ -175,7 +176,7 @@ def sensors(at: Clock, values: Array, smooth: Array) -> Array:
 
 
 def commands(at: Clock, values: Array) -> Array:
-    """Commands (rows, n), each held over the time that ends at its row, over the intervals that end at the samples (K + 1, n).
+    """Commands (rows, n), each held over the time that ends at its row, over the intervals between the samples (K + 1, n).
 
     Where rows and samples are the same, they are the rows'; else the average over the interval, NaN where half of it or
     more is unknown.

@@ -16,7 +16,7 @@ from fdi_gym.recordings.tables import need
 
 
 def channel_columns(plant: Plant) -> tuple[str, ...]:
-    """The names of the observed channels as columns: the data sheet's; of two that are the same, the later says what it is."""
+    """The names of the observed channels as columns: the data sheet's; of two of a name, the later says what it is."""
     n_y, n_u = len(plant.outputs), len(plant.commands)
     found: list[str] = []
     for i, signal in enumerate(plant.observed):
@@ -45,7 +45,7 @@ def to_frame(plant: Plant, record: Record, flight: int = 0, truth: bool = False)
         plant: The plant of the record; a record does not know its channels' names.
         record: The record.
         flight: Which of its flights.
-        truth: Also the state, the fault parameter and the estimated quantity, as "state: ...", "theta: ...", "estimated: ...".
+        truth: Also the state, the fault parameter and the estimated quantity: "state: ...", "theta: ...", "estimated: ...".
     """
     samples = int(record.length[flight]) + 1
     names = np.array([label.name for label in plant.labels])
@@ -59,7 +59,7 @@ def to_frame(plant: Plant, record: Record, flight: int = 0, truth: bool = False)
 
 
 def write_table(path: Path, columns: Mapping[str, Array], units: Mapping[str, str]) -> None:
-    """Write columns as Parquet (units in the columns' metadata) or as CSV (units in its head, "p [deg/s]"), whole or not at all.
+    """Write columns as Parquet (units in the columns' metadata) or as CSV (units in its head, "p [deg/s]"), whole.
 
     Args:
         path: Its name ends in ".parquet" or ".csv".

@@ -41,8 +41,8 @@ def of_units(plant: Plant, obs: Array) -> list[str]:
         if outside > OUTSIDE:
             fits = [u for u, f in others.items() if f < 1 and _within(f * values, signal.low, signal.high)]
             found.append(
-                f"{name} is outside its range [{signal.low:g}, {signal.high:g}] {signal.unit} in {100 * outside:.0f} % of the "
-                f"samples (from {values.min():.4g} to {values.max():.4g}){_guess(name, fits)}"
+                f"{name} is outside its range [{signal.low:g}, {signal.high:g}] {signal.unit} in {100 * outside:.0f} % of "
+                f"the samples (from {values.min():.4g} to {values.max():.4g}){_guess(name, fits)}"
             )
         elif signal.sigma > 0 and values.size >= ENOUGH:
             noise = _noise(values)
@@ -76,7 +76,8 @@ def of_commands(plant: Plant, obs: Array) -> list[str]:
     names = ", ".join(channel_columns(plant)[len(plant.outputs) : len(plant.outputs) + len(plant.commands)])
     return (
         [
-            f'{names}: looks like u_k, not the command of the interval that has just ended, since {why}; "commands": "u_k" moves it'
+            f"{names}: looks like u_k, not the command of the interval that has just ended, since {why}; "
+            '"commands": "u_k" moves it'
         ]
         if why
         else []

@@ -4,9 +4,10 @@
     skab      Skoltech Anomaly Benchmark: CSV separated by ";", "anomaly" and "changepoint" beside the sensors; files of its
               folder "anomaly-free" have neither
     braatz    Tennessee Eastman process as Chiang, Russell and Braatz simulated it: d00.dat to d21.dat (training) and
-              d00_te.dat to d21_te.dat (test; the fault acts from sample 160 on), 52 columns without a head, d00.dat on its side
-    alfa      AirLab Failure and Anomaly flights: a folder a flight with a CSV for each topic; what failed, and from when on, is
-              in the topics "failure_status-..."
+              d00_te.dat to d21_te.dat (test; the fault acts from sample 160 on), 52 columns without a head, d00.dat on its
+              side
+    alfa      AirLab Failure and Anomaly flights: a folder a flight with a CSV for each topic; what failed, and from when on,
+              is in the topics "failure_status-..."
 
 Nothing of these collections is shipped. A reader gives a `Table` with a column "label" for each flight.
 """

@@ -125,8 +125,8 @@ def _columns(plant: Plant, table: Table, mapping: Mapping) -> dict[str, Column]:
         found[name] = column
     if missing:
         raise RefusedError(
-            f"{table.source}: there is no column for {', '.join(missing)}; it has {_some(table.units)}. A mapping says which "
-            'column is what ({"channels": {"'
+            f"{table.source}: there is no column for {', '.join(missing)}; it has {_some(table.units)}. A mapping says "
+            'which column is what ({"channels": {"'
             + missing[0]
             + '": "..."}}) and what was '
             + f'"not_recorded": ["{missing[0]}"]'
@@ -149,8 +149,8 @@ def _scaled(table: Table, column: Column, wanted: str, values: dict[str, Array])
         factor = factor_between(unit, wanted)
         if factor is None:
             raise RefusedError(
-                f"{table.source}: {column.column} is in {unit!r}, the plant wants {wanted!r}, and nothing is known of how one is "
-                "made of the other: give a factor"
+                f"{table.source}: {column.column} is in {unit!r}, the plant wants {wanted!r}, and nothing is known of how "
+                "one is made of the other: give a factor"
             )
     raw = values[column.column]
     if raw.dtype.kind == "U":  # also the time, or a label
@@ -279,7 +279,6 @@ def label_index(plant: Plant, word: str, names: dict[str, str], source: str) -> 
         number = float(said)
     except ValueError:
         number = np.nan
-    if number == int(number) if np.isfinite(number) else False:
-        if 0 <= number < len(known):
-            return int(number)
+    if number in range(len(known)):
+        return int(number)
     raise RefusedError(f"{source}: {unknown('label', said, known, plant.id)}, or their numbers from 0")

@@ -90,7 +90,8 @@ def decision_columns(plant: Plant, said: Mapping[str, Decisions], time: Array) -
     for name, one in said.items():
         n = len(time)
         columns: dict[str, Array] = {
-            "method": np.full(n, name), "sample": np.arange(n), "time": time, "alarm": one.alarm[0], "label": names[one.label[0]],
+            "method": np.full(n, name), "sample": np.arange(n), "time": time, "alarm": one.alarm[0],
+            "label": names[one.label[0]],
         }  # fmt: skip
         for kind, values in (("", one.estimate), ("std of ", one.estimate_std)):
             blank = np.full((n, len(entries)), np.nan)

@@ -185,15 +185,13 @@ def _text(path: Path, header: bool, separator: str | None) -> Table:
         rows = _cells(path, separator)
         if header:
             next(rows)
-        count = 0
-        for number, cells in rows:
+        for count, (number, cells) in enumerate(rows):
             if len(cells) != len(names):
                 raise RefusedError(f"{path}: line {number} has {len(cells)} cells, the first one has {len(names)}")
-            held.append(cells)
-            at.append(number)
             if count == ROWS:
                 raise RefusedError(f"{path} has more than {ROWS} rows")
-            count += 1
+            held.append(cells)
+            at.append(number)
             if len(held) == PIECE:
                 finish()
         finish()
