@@ -76,7 +76,7 @@ def test_the_row_of_a_new_package_is_verified_and_its_board_rendered(made, name,
     assert code == 0, err
     before = {path.name: path.read_bytes() for path in (place / name / "boards").glob("*.md")}
     assert f"{bench}.md" in before
-    code, out, err = call("leaderboard", "--results", "results", "--pages", "boards", "--no-pictures", cwd=place / name)
+    code, _, err = call("leaderboard", "--results", "results", "--pages", "boards", "--no-pictures", cwd=place / name)
     assert code == 0, err
     assert {path.name: path.read_bytes() for path in (place / name / "boards").glob("*.md")} == before
     code, _, err = call("evaluate", f"{name}.suites:{bench}", "--diagnosers", "null", "--episodes", 3, "--jobs", 1)
