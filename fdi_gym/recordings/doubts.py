@@ -25,7 +25,10 @@ def doubts(plant: Plant, obs: Array, commands: str = "u_k-1") -> list[str]:
         obs: The observations.
         commands: As in the mapping; where it says that they were moved already, they are not doubted.
     """
-    return of_units(plant, obs) + (of_commands(plant, obs) if commands == "u_k-1" else [])
+    found = of_units(plant, obs)
+    if not found and commands == "u_k-1":  # in another unit, the equations would say anything of the commands
+        found += of_commands(plant, obs)
+    return found
 
 
 def of_units(plant: Plant, obs: Array) -> list[str]:

@@ -81,7 +81,7 @@ def observations(plant: Plant, source: Any, mapping: Mapping | None = None) -> R
         label = _label(plant, table, mapping, values, at, t, stamps, time)
     if mapping.not_recorded:
         notes.append(f"not recorded: {', '.join(mapping.not_recorded)}")
-    return Recording(obs, at.samples - at.t[0], label, (*notes, *at.notes))
+    return Recording(obs, np.round(at.samples - at.t[0], 9), label, (*notes, *at.notes))
 
 
 def as_record(plant: Plant, recordings: Sequence[Recording]) -> Record:
@@ -214,7 +214,7 @@ def _onset(table: Table, mapping: Mapping) -> Onset | None:
     if isinstance(mapping.onset, Onset):
         return mapping.onset
     beside = [name if name in table.units else None for name in ("end", "fault")]
-    return Onset(mapping.onset or "onset", *beside)
+    return Onset(mapping.onset or "onset", beside[0], beside[1])
 
 
 def _label(

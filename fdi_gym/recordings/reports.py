@@ -43,7 +43,7 @@ def _event(plant: Plant, said: Decisions, flight: int, first: int, after: int) -
     values, counts = np.unique(said.label[flight, first:after], return_counts=True)
     order = np.argsort(-counts, kind="stable")
     labels = tuple(
-        (plant.labels[values[i]].name if values[i] >= 0 else "lost", counts[i] / (after - first)) for i in order
+        (plant.labels[values[i]].name if values[i] >= 0 else "lost", float(counts[i]) / (after - first)) for i in order
     )  # fmt: skip
     half = slice((first + after) // 2, after)
     settled = [
