@@ -44,7 +44,7 @@ def _shared_surprise(plant: Plant, obs: Array) -> float:
     if plant.true_feedback:
         return 0.0
     n_y, n_u = len(plant.outputs), len(plant.commands)
-    whole: Array = np.isfinite(obs).all(axis=1)
+    whole = np.asarray(np.isfinite(obs).all(axis=1))
     k = np.flatnonzero(whole[2:] & whole[1:-1] & whole[:-2]) + 2
     sizes = np.array([s.scale for s in plant.observed])
     z = obs / sizes
