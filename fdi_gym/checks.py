@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fdi_gym import shapes
+from fdi_gym.data_sheet import Kernels
 from fdi_gym.faults import Abrupt, Effect, FaultProcess, FaultScenario, Hold, Incipient, Intermittent, Samples, Square
 
 if TYPE_CHECKING:
     from fdi_gym.data_sheet import FaultMode, Signal
     from fdi_gym.plant import Plant
 
-OPTIONAL_KERNELS = ("known", "project", "outside")
 X0_RANGES = 10.0  # an initial state lies within so many times its declared range
 
 
@@ -76,7 +76,7 @@ def _wrong(plant: Plant) -> Iterable[str]:
         yield f"substeps is a whole number from 0 on, not {plant.substeps!r}"
     kernels = plant.kernels
     for role, kernel in kernels._asdict().items() if kernels is not None else ():
-        if not hasattr(kernel, "py_func") and not (kernel is None and role in OPTIONAL_KERNELS):
+        if not hasattr(kernel, "py_func") and not (kernel is None and role in Kernels._field_defaults):
             yield f"the kernel {role!r} is a function marked @kernel, not {kernel!r}"
     for role in ("physical", "reference", "monitor"):
         if not callable(getattr(plant, role)):
