@@ -118,7 +118,10 @@ def _reports() -> Iterator[tuple[str, str]]:
     for name in suite_names():
         folder = BOARDS / "results" / name
         if folder.is_dir():
-            yield f"reports/{name}.html", report(read_board(folder, load_suite(name)), flights=FLIGHTS, progress=False)
+            yield (
+                f"reports/{name}.html",
+                report(read_board(folder, {name: load_suite(name)}), flights=FLIGHTS, progress=False),
+            )
 
 
 def _front(text: str, reports: list[str]) -> str:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fdi_gym import shapes
+from fdi_gym.data_sheet import Kernels
 from fdi_gym.faults import (
     Abrupt,
     Effect,
@@ -85,8 +86,9 @@ def _wrong(plant: Plant) -> Iterable[str]:
         yield f"dt is a positive number of seconds, not {plant.dt!r}"
     if not is_whole(plant.substeps) or plant.substeps < 0:
         yield f"substeps is a whole number from 0 on, not {plant.substeps!r}"
-    for role, kernel in plant.kernels._asdict().items():
-        if not hasattr(kernel, "py_func") and not (kernel is None and role in plant.kernels._field_defaults):
+    kernels = plant.kernels
+    for role, kernel in kernels._asdict().items() if kernels is not None else ():
+        if not hasattr(kernel, "py_func") and not (kernel is None and role in Kernels._field_defaults):
             yield f"the kernel {role!r} is a function marked @kernel, not {kernel!r}"
     for role in ("physical", "reference", "monitor"):
         if not callable(getattr(plant, role)):

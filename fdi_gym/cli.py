@@ -8,12 +8,14 @@ from typing import Any
 
 import tyro
 
-from fdi_gym.commands import methods, pages, rows, suites
+from fdi_gym.commands import methods, packages, pages, recordings, rows, suites
 
 COMMANDS: dict[str, Any] = {
     "evaluate": rows.evaluate, "verify": rows.verify,
     "leaderboard": pages.leaderboard, "report": pages.report, "plot": pages.plot,
     "list": suites.show, "freeze": suites.freeze, "fit": methods.fit, "train": methods.train,
+    "diagnose": recordings.diagnose, "collect": recordings.collect, "export": recordings.export,
+    "new": packages.new, "check": packages.check,
 }  # fmt: skip
 
 

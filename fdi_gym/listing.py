@@ -20,7 +20,8 @@ from fdi_gym.diagnosis.registry import GIVEN, GROUPS
 from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.faults import draw
 from fdi_gym.names import blamed, find_module, unknown
-from fdi_gym.suite import Suite, load_suite, suite_names
+from fdi_gym.recordings.suite import RecordedSuite
+from fdi_gym.suite import AnySuite, load_suite, suite_names
 
 
 def find_plant(text: str) -> tuple[str, str]:
@@ -33,12 +34,23 @@ def find_plant(text: str) -> tuple[str, str]:
         ValueError: There is none.
     """
     module, _, name = text.rpartition(":")
+    found = as_plant(text)
+    if found is None:
+        raise unknown("plant", name, plant_sources())
+    return module, found
+
+
+def as_plant(text: str) -> str | None:
+    """The id of the plant that a plant or environment id names, "module:id" too; None where it names none.
+
+    Raises:
+        ValueError: The module before a ":" cannot be imported.
+    """
+    module, _, name = text.rpartition(":")
     if module:
         find_module(module)
     ids = {f"{plant}-Faults-v{source.version}": plant for plant, source in plant_sources().items()}
-    if name not in ids and name not in ids.values():
-        raise unknown("plant", name, ids.values())
-    return module, ids.get(name, name)
+    return name if name in ids.values() else ids.get(name)
 
 
 def overview() -> str:
@@ -97,7 +109,10 @@ def _outside(text: str, name: str) -> str:
     return _diagnoser(find_diagnoser(text))
 
 
-def _suite(suite: Suite) -> str:
+def _suite(suite: AnySuite) -> str:
+    if isinstance(suite, RecordedSuite):
+        lines = [f"{suite.name}: {suite.description}", "", f"  recorded     {suite.episodes} flights, {suite.env}"]
+        return "\n".join([*lines, f"  layout       {suite.layout}", f"  version      {suite.sha256[:12]}"])
     lines = [f"{suite.name}: {suite.description}", "", f"  environment  {suite.env}", f"  options      {suite.options}"]
     lines += [f"  process      {suite.process}", f"  mismatch     {suite.mismatch}"]
     seeds = [*suite.seeds, *suite.healthy]

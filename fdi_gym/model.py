@@ -15,6 +15,10 @@ FLOAT = np.dtype(float)
 SENSOR_FAULTS = ("gain", "bias", "noise", "frozen", "lag", "missing")  # columns of `fdi_gym.sensors`, in order
 
 
+class NotApplicableError(ValueError):
+    """A method's word that it cannot run on a plant, with the reason (no unknown input, rank condition)."""
+
+
 def contiguous(a: Any) -> Array:
     """As the compiled kernels take an array: float64, in C order and writable; a copy only of one that is not."""
     if type(a) is Array and a.dtype is FLOAT and a.flags.carray:
@@ -71,8 +75,15 @@ class Model:
 
     @functools.cached_property
     def addresses(self) -> tuple[int, ...]:
-        """Addresses of the compiled kernels in the order of `Kernels`, with the defaults where the plant has none."""
+        """Addresses of the compiled kernels in the order of `Kernels`, with the defaults where the plant has none.
+
+        Raises:
+            NotApplicableError: The plant declares channels, and no equations.
+        """
         from fdi_gym import kernels
+
+        if self.kernels is None:
+            raise NotApplicableError("needs equations; this plant declares channels only")
 
         given = zip(self.kernels._fields, self.kernels, strict=True)
         return tuple(kernels.address(function or getattr(kernels, role)) for role, function in given)

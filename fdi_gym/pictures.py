@@ -10,13 +10,13 @@ from fdi_gym import plots
 from fdi_gym.comparison import cliques
 from fdi_gym.curves import delay_curve, severity_curve
 from fdi_gym.diagnosis import Decisions, make_diagnoser, run
-from fdi_gym.engine import Record, simulate
+from fdi_gym.engine import Record
 from fdi_gym.evaluation import settings_of
 from fdi_gym.leaderboard import Board, framing, read_board
 from fdi_gym.metrics import BANDS
 from fdi_gym.names import blamed, unknown
 from fdi_gym.plant import Plant
-from fdi_gym.suite import Suite
+from fdi_gym.suite import AnySuite
 from fdi_gym.tables import by_isolation
 
 BEST = 4  # methods that are shown where none is named
@@ -24,7 +24,7 @@ FLOWN, OF_ONE = ("flight", "signals"), ("signals", "confusion")
 
 
 def picture(
-    kind: str, suite: Suite, methods: Sequence[str], results: Path, *, flight: int = 0, sensors: bool = False
+    kind: str, suite: AnySuite, methods: Sequence[str], results: Path, *, flight: int = 0, sensors: bool = False
 ) -> Any:
     """A figure.
 
@@ -44,7 +44,7 @@ def picture(
     most = len(plots.LINES)
     if len(methods) > most:
         raise ValueError(f"a picture tells up to {most} methods apart, not {len(methods)}")
-    board = None if kind in FLOWN and methods else read_board(results / suite.name, suite)
+    board = None if kind in FLOWN and methods else read_board(results / suite.name, {suite.name: suite})
     names = list(dict.fromkeys(methods)) if board is None else _names(board, kind, methods)
     if kind in FLOWN:
         plant, record, said = _flown(suite, names, flight)
@@ -79,12 +79,12 @@ def _names(board: Board, kind: str, methods: Sequence[str]) -> list[str]:
     return found
 
 
-def _flown(suite: Suite, names: Sequence[str], flight: int) -> tuple[Plant, Record, dict[str, Decisions]]:
+def _flown(suite: AnySuite, names: Sequence[str], flight: int) -> tuple[Plant, Record, dict[str, Decisions]]:
     if not 0 <= flight < suite.episodes:
         raise ValueError(f"{suite.name} has the flights 0 to {suite.episodes - 1}, not {flight}")
     plant = suite.build()
     scenarios = suite.scenarios(plant, [flight])
-    record, said = simulate(plant, scenarios), {}
+    record, said = suite.record(plant, [flight]), {}
     for name in names:
         with blamed(name):
             settings = settings_of(suite, plant, name)

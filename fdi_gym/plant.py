@@ -18,12 +18,9 @@ from fdi_gym.checks import check_declaration, check_scenario, twice, unknown
 from fdi_gym.data_sheet import FaultMode, Kernels, Label, Signal, squared_error
 from fdi_gym.faults import FaultProcess, FaultScenario
 from fdi_gym.model import Array
+from fdi_gym.model import NotApplicableError as NotApplicableError
 from fdi_gym.shapes import OPEN, Shapes
 from fdi_gym.truth import Truth
-
-
-class NotApplicableError(ValueError):
-    """A method's word that it cannot run on a plant, with the reason (no unknown input, rank condition)."""
 
 
 def _no_rows(scenario: FaultScenario) -> Array:
@@ -75,7 +72,7 @@ class Plant(Truth):
         dt: Sample time [s].
         substeps: Runge-Kutta steps per sample; 0 for a discrete plant, whose dynamics kernel gives the next state.
         linear: The dynamics are linear in x, and bilinear in (u, theta).
-        kernels: The compiled equations.
+        kernels: The compiled equations; None where only channels are known: no model-based method runs.
         states, outputs, commands, known, disturbances: Data sheets of the vectors, in order.
         theta: Data sheet of the fault parameter; `nominal` is the healthy value.
         estimated: Data sheet of what the identification task asks for. Default: theta itself.
@@ -115,7 +112,7 @@ class Plant(Truth):
     description: str
     dt: float
     substeps: int
-    kernels: Kernels
+    kernels: Kernels | None
     states: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
     commands: tuple[Signal, ...]
@@ -168,7 +165,8 @@ class Plant(Truth):
         from fdi_gym.kernels import Sent
 
         state = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        state["kernels"] = Kernels(*(f if f is None else Sent(f) for f in self.kernels))
+        if self.kernels is not None:
+            state["kernels"] = Kernels(*(f if f is None else Sent(f) for f in self.kernels))
         return object.__new__, (Plant,), state
 
     def __eq__(self, other: object) -> bool:

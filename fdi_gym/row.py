@@ -32,7 +32,7 @@ from fdi_gym.files import (
 from fdi_gym.metrics import Outcome, check_outcomes
 from fdi_gym.names import check_diagnoser_name, check_name, file_name
 from fdi_gym.plant import Plant
-from fdi_gym.suite import Suite
+from fdi_gym.suite import AnySuite
 
 LARGEST = 2**20  # bytes of a row's file
 MADE = "made.json"
@@ -167,7 +167,7 @@ def row_files(folder: Path) -> Iterator[Path]:
     return (path for path in sorted(folder.glob("*.json")) if path.name != MADE)
 
 
-def check_writable(results: Path, suite: Suite, rows: Mapping[str, Mapping[str, str]], replace: bool = False) -> None:
+def check_writable(results: Path, suite: AnySuite, rows: Mapping[str, Mapping[str, str]], replace: bool = False) -> None:
     """Make sure, before anything runs, that rows can be written and nothing would be lost.
 
     Args:
@@ -207,7 +207,7 @@ def check_writable(results: Path, suite: Suite, rows: Mapping[str, Mapping[str, 
             )
 
 
-def write_rows(results: Path, suite: Suite, evaluated: Mapping[str, Evaluated]) -> None:
+def write_rows(results: Path, suite: AnySuite, evaluated: Mapping[str, Evaluated]) -> None:
     """Write rows and their outcomes, and how they were made into the file beside them.
 
     Raises:

@@ -170,13 +170,14 @@ def _scenario(outcomes: Sequence[Outcome], dt: float) -> dict[str, Any]:
     said = [flight.declaration for flight in outcomes]
     found = [f for one in said for f in one.found]
     onsets = np.abs([f.onset for f in found]) * dt
+    sizes = np.abs([f.size for f in found if f.size is not None])
     return {
         "worth": float(np.mean([one.worth for one in said])),
         "exact": float(np.mean([one.exact for one in said])),
         "found": float(len(found) / modes) if (modes := sum(one.modes for one in said)) else None,
         "onset_error_quartiles": np.quantile(onsets, (0.25, 0.5, 0.75)).tolist() if found else None,
         "overlap": float(np.mean([f.overlap for f in found])) if found else None,
-        "size_error": float(np.median(np.abs([f.size for f in found]))) if found else None,
+        "size_error": float(np.median(sizes)) if sizes.size else None,
     }
 
 

@@ -1,13 +1,16 @@
 """Suites: frozen JSON files that say which environment, which fault process and which seeds.
 
-A suite's content hash travels with every result.
+A suite's content hash travels with every result. Suites of recorded flights (`fdi_gym.recordings.suite`) are loaded by the
+same names. Packages bring theirs by the entry-point group "fdi_gym.suites": a package in whose folder the files are.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -16,11 +19,13 @@ import numpy as np
 
 from fdi_gym.diagnosis import find_diagnoser
 from fdi_gym.discovery import load_plant, plant_sources
+from fdi_gym.engine import Record, simulate
 from fdi_gym.faults import MAX_STEPS, FaultScenario, draw
 from fdi_gym.files import RefusedError, digest, pretty, read_json, write_whole
 from fdi_gym.names import blame, check_diagnoser_name, check_name, find_function, find_module, unknown
 from fdi_gym.options import Options
 from fdi_gym.plant import Plant
+from fdi_gym.recordings.suite import RecordedSuite, read_recorded
 
 _PACKAGED = Path(__file__).parent / "suites"
 _CHECKOUT = Path(__file__).parent.parent / "leaderboards" / "suites"
@@ -223,6 +228,10 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             found.append(scenario if self.steps is None else scenario.replace(steps=min(scenario.steps, self.steps)))
         return found
 
+    def record(self, plant: Plant, episodes: Sequence[int]) -> Record:
+        """These flights, flown."""
+        return simulate(plant, self.scenarios(plant, episodes))
+
     def check_scenarios(self, plant: Plant) -> None:
         """Make sure that this version draws what the suite was frozen with.
 
@@ -233,25 +242,55 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise ValueError(f"{self.name}: this version draws other scenarios than the suite was frozen with")
 
 
+AnySuite = Suite | RecordedSuite
+
+
+def suite_files() -> dict[str, Path]:
+    """The files of the suites that are installed, by name: those of this package, then those of others."""
+    found: dict[str, Path] = {}
+    for folder in (SUITES, *(_folder(entry_point.value) for entry_point in entry_points(group="fdi_gym.suites"))):
+        for path in sorted(folder.glob("*.json")) if folder is not None else ():
+            found.setdefault(path.stem, path)
+    return found
+
+
+def _folder(module: str) -> Path | None:
+    """Where a package or module lies; None where there is none."""
+    try:
+        spec = importlib.util.find_spec(module)
+    except Exception:  # whatever a package does when it is imported
+        return None
+    place = spec and (next(iter(spec.submodule_search_locations or ()), None) or (spec.origin and Path(spec.origin).parent))
+    return Path(place) if place else None
+
+
 def suite_names() -> list[str]:
-    """Names of the suites that ship with the package."""
-    return sorted(path.stem for path in SUITES.glob("*.json"))
+    """Names of the suites that are installed."""
+    return sorted(suite_files())
 
 
-def load_suite(name: str) -> Suite:
-    """A suite by name, or from a path that ends in ".json".
+def load_suite(name: str) -> AnySuite:
+    """A suite by name, "module:name" where its file lies beside a module's, or from a path that ends in ".json".
 
     Raises:
         ValueError: No such suite; `RefusedError` where its file is none, or was edited after it was frozen.
     """
+    module, _, within = name.rpartition(":")
+    known = suite_files()
     if name.endswith(".json"):
         path = Path(name)
         if not path.is_file():
             raise ValueError(f"there is no suite {name}")
-    elif name not in suite_names():
-        raise unknown("suite", name, suite_names())
+    elif module and (folder := _folder(module)) is not None:
+        path = folder / f"{check_name('suite', within)}.json"
+        if not path.is_file():
+            raise ValueError(f"there is no suite {within!r} in {folder}")
+    elif name not in known:
+        raise unknown("suite", name, sorted(known))
     else:
-        path = SUITES / f"{name}.json"
+        path = known[name]
+    if "flights" in read_json(path, dict[str, msgspec.Raw], "suite"):
+        return read_recorded(path)
     suite = read_json(path, Suite, "suite", LARGEST)
     if suite.name != path.stem:
         raise RefusedError(f"{path} holds a suite that is called {suite.name}")

@@ -22,7 +22,7 @@ from fdi_gym.names import unknown
 from fdi_gym.plant import Plant
 from fdi_gym.row import Row, read_outcomes, read_row
 from fdi_gym.scores import summarise
-from fdi_gym.suite import Suite, load_suite
+from fdi_gym.suite import AnySuite, load_suite
 
 
 def _differences(said: Any, found: Any, path: str, tolerance: float = 1e-9) -> Iterator[str]:
@@ -48,7 +48,7 @@ def _compare(row: Row, said: Any, found: Any, path: str, tolerance: float = 1e-9
         raise RefusedError(f"{row.suite}/{row.diagnoser}: {'; '.join(text[:300] for text in differences[:5])}")
 
 
-def check_row(row: Row, outcomes: Sequence[Outcome], suite: Suite, plant: Plant) -> None:
+def check_row(row: Row, outcomes: Sequence[Outcome], suite: AnySuite, plant: Plant) -> None:
     """Compare a row with its suite and its outcomes: its figures. Nothing is run or imported.
 
     Raises:
@@ -65,7 +65,7 @@ def check_row(row: Row, outcomes: Sequence[Outcome], suite: Suite, plant: Plant)
     _compare(row, row.metrics, found, "metrics")
 
 
-def check_made_by(row: Row, suite: Suite, plant: Plant) -> None:
+def check_made_by(row: Row, suite: AnySuite, plant: Plant) -> None:
     """Compare a row with the code that is here: its settings, and the digests of what made it.
 
     Raises:
@@ -76,7 +76,7 @@ def check_made_by(row: Row, suite: Suite, plant: Plant) -> None:
     _compare(row, digests, digests_of(suite, plant, row.diagnoser), "digests")
 
 
-def check_episodes(row: Row, outcomes: Sequence[Outcome], suite: Suite, plant: Plant, episodes: Sequence[int]) -> None:
+def check_episodes(row: Row, outcomes: Sequence[Outcome], suite: AnySuite, plant: Plant, episodes: Sequence[int]) -> None:
     """Run episodes again and compare their outcomes.
 
     Raises:

@@ -13,21 +13,27 @@ from fdi_gym.commands.arguments import Names, SuiteName
 RESULTS = Path("leaderboards/results")
 
 
-def leaderboard(results: Path = RESULTS, pages: Path = Path("leaderboards"), pictures: bool = True) -> None:
+def leaderboard(
+    results: Path = RESULTS,
+    pages: Path = Path("leaderboards"),
+    pictures: bool = True,
+    suites: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SUITE")] = (),
+) -> None:
     """Render the tables of all rows: README.md, a page for each suite, and their pictures.
 
     Args:
         results: Folder of the rows.
         pages: Folder of the pages.
         pictures: Draw the pictures, too.
+        suites: Paths of suites, or "module:name", that are not installed.
     """
     from fdi_gym import leaderboard
     from fdi_gym.files import write_whole
 
-    for name, text in leaderboard.render(results).items():
+    for name, text in leaderboard.render(results, suites).items():
         write_whole(pages / name, text.encode())
         print(pages / name)
-    for board in leaderboard.boards(results) if pictures else ():
+    for board in leaderboard.boards(results, suites) if pictures else ():
         leaderboard.draw(board, pages / "pictures")
 
 
@@ -53,7 +59,7 @@ def report(
     from fdi_gym.suite import load_suite
 
     frozen = load_suite(suite)
-    page = make(read_board(results / frozen.name, frozen), methods, flights, sys.stderr.isatty()).encode()
+    page = make(read_board(results / frozen.name, {frozen.name: frozen}), methods, flights, sys.stderr.isatty()).encode()
     write_whole(output, page)
     print(f"{output}: {len(page) / 1e6:.1f} MB")
 

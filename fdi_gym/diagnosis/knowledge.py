@@ -129,8 +129,13 @@ def knowledge_of(entry: Entry, plant: Plant, process: str, settings: Mapping[str
     """The belief and the calibration that a method's builder takes: shipped, or found now and kept for the session.
 
     Nobody is told which samples go missing: what is known is that of sensors which report at every one.
+
+    Raises:
+        NotApplicableError: It takes some, and the plant has no equations from which they could be found.
     """
     found: dict[str, Any] = {}
+    if plant.kernels is None and (entry.takes("belief") or entry.takes("calibration")):
+        raise NotApplicableError(f"needs equations; {plant.id} declares channels only")
     plant, process = entry.told(plant, process)
     plant = plant if plant.regular is None else plant.regular
     if entry.takes("belief"):

@@ -42,7 +42,7 @@ def make_diagnoser(
     given: dict[str, Any] = {"process": process} if entry.takes("process") else {}
     if entry.clairvoyant:
         if scenarios is None:
-            raise ValueError(f"{name} knows the truth: it needs scenarios, one per episode")
+            raise NotApplicableError(f"{name} knows the truth: it needs scenarios, one per episode")
         given["scenarios"] = scenarios
     try:
         given |= knowledge_of(entry, plant, process, settings)

@@ -7,6 +7,7 @@ matplotlib is imported when something is drawn.
 from fdi_gym.palette import LINES
 from fdi_gym.plots.canvas import Canvas
 from fdi_gym.plots.flights import flight, method_signals
+from fdi_gym.plots.recordings import recording
 from fdi_gym.plots.scores import confusions, delays, ranking, severities
 
-__all__ = ["LINES", "Canvas", "confusions", "delays", "flight", "method_signals", "ranking", "severities"]
+__all__ = ["LINES", "Canvas", "confusions", "delays", "flight", "method_signals", "ranking", "recording", "severities"]

@@ -17,13 +17,14 @@ from tqdm import tqdm
 
 from fdi_gym.declaration import runs
 from fdi_gym.diagnosis import Decisions, make_diagnoser, run
-from fdi_gym.engine import Record, simulate
+from fdi_gym.engine import Record
 from fdi_gym.estimation.equivalent import nearest
 from fdi_gym.evaluation import settings_of
 from fdi_gym.leaderboard import Board
 from fdi_gym.metrics import DEVIATIONS
 from fdi_gym.names import blamed
 from fdi_gym.plant import Array, Plant
+from fdi_gym.suite import AnySuite, Suite
 
 BLOCK = 20  # flights that are flown and diagnosed together
 MOST, LEAST = 600, 24  # points of a line
@@ -87,7 +88,7 @@ def flown(board: Board, names: Sequence[str], flights: Sequence[int], budget: Bu
     with tqdm(total=len(blocks) * len(names), desc="flights", unit="run", disable=not progress) as bar:
         for block in blocks:
             scenarios = suite.scenarios(plant, block)
-            record = simulate(plant, scenarios)
+            record = suite.record(plant, block)
             said: dict[str, Decisions] = {}
             for name in names:
                 bar.set_postfix_str(name)
@@ -96,14 +97,20 @@ def flown(board: Board, names: Sequence[str], flights: Sequence[int], budget: Bu
                     diagnoser = make_diagnoser(name, plant, process=suite.process, scenarios=scenarios, **settings)
                     said[name] = run(diagnoser, record.obs, signals=True)
                 bar.update()
-            seeds = [*suite.seeds, *suite.healthy]
             for j, flight in enumerate(block):
+                seed, healthy = _origin(suite, flight)
                 found.append(_flight(plant, record, j, budget) | {
-                    "number": flight, "seed": seeds[flight * suite.windows],
-                    "healthy": flight * suite.windows >= len(suite.seeds),
+                    "number": flight, "seed": seed, "healthy": healthy,
                     "said": {name: _said(plant, record, of, j, budget) for name, of in said.items()},
                 })  # fmt: skip
     return {"flights": found, "methods": list(names), "points": budget.points, "dt": plant.dt, "deviations": DEVIATIONS}
+
+
+def _origin(suite: AnySuite, flight: int) -> tuple[int | str, bool]:
+    """The (first) seed of a flight, or the file that it was recorded in, and whether it was made healthy."""
+    if not isinstance(suite, Suite):
+        return list(suite.flights)[flight], False
+    return [*suite.seeds, *suite.healthy][flight * suite.windows], flight * suite.windows >= len(suite.seeds)
 
 
 def _flight(plant: Plant, record: Record, i: int, budget: Budget) -> dict[str, Any]:
