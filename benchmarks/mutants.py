@@ -1,0 +1,235 @@
+"""Do the tests notice a flipped sign? Draws mutants of the methods and scores at random and runs the tests of their area.
+
+    python benchmarks/mutants.py --seed 1 [--count 100] [--work runs/mutants] [--survivors]
+
+A mutant is one change of a syntax tree: an arithmetic operator becomes its inverse, a comparison its negation, `and` is
+`or`, a negation or a minus sign goes, a number gets the other sign, True is False, a condition is its opposite. Numbers
+that say along which axis, annotations, decorators and messages of errors are left alone. At most a third of the mutants are
+drawn in files that numba compiles, since each of those is compiled anew.
+
+The tests are those that name the changed module or the methods it registers, and those of its folder (`AREAS`). The
+sources are copied to the work folder and stay as they were drawn; the tests are those of the checkout at each start. A run
+that was killed goes on; `--survivors` runs those again that no test killed, for tests written since.
+"""
+
+import argparse
+import ast
+import copy
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from fdi_gym.files import write_whole
+from fdi_gym.tables import markdown
+
+ROOT = Path(__file__).parent.parent
+MUTATED = [
+    "fdi_gym/estimation", "fdi_gym/diagnosis", "baselines/filters", "baselines/learned",
+    *(f"fdi_gym/{name}.py" for name in ("metrics", "scores", "intervals", "declaration", "tasks")),
+]  # fmt: skip
+AREAS = {  # what tests a folder as a whole, beside the tests that name a file
+    "fdi_gym/estimation": ["gaussian", "general_filters", "general_methods"],
+    "fdi_gym/diagnosis": ["guard", "shells", "knowledge", "conformance"],
+    "baselines/filters": ["general_methods", "conformance"],
+    "baselines/learned": ["learned", "reinforcement"],
+    "fdi_gym": ["metrics", "evaluation", "suites"],
+}
+ELSEWHERE = {"cli", "rows", "fuzz_rows", "interrupted", "readme", "sb3", "reproduction", "grid", "engine", "scenarios"}
+FLIPPED = {
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult,
+    ast.Pow: ast.Mult, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd, ast.LShift: ast.RShift, ast.RShift: ast.LShift,
+    ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In, ast.And: ast.Or, ast.Or: ast.And,
+}  # fmt: skip
+
+
+class Mutant(msgspec.Struct):
+    """One change of one file, and what became of it."""
+
+    file: str
+    line: int
+    before: str
+    after: str
+    start: int  # of the text that changes, in bytes
+    stop: int
+    tests: list[str]
+    killed: bool | None = None  # None: not run yet
+    by: str = ""
+    seconds: float = 0.0
+
+
+class _Change(NamedTuple):
+    node: ast.AST
+    into: ast.AST
+
+
+def changes(node: ast.AST) -> Iterator[_Change]:
+    """All changes of a tree that may alter what it computes."""
+    match node:
+        case ast.Raise() | ast.JoinedStr() | ast.ImportFrom() | ast.Import():
+            return
+        case ast.BinOp(op=op) | ast.AugAssign(op=op) | ast.BoolOp(op=op) if type(op) in FLIPPED:
+            yield _Change(node, _with(node, op=FLIPPED[type(op)]()))
+        case ast.Compare(ops=ops):
+            for i, op in enumerate(ops):
+                yield _Change(node, _with(node, ops=[*ops[:i], FLIPPED[type(op)](), *ops[i + 1 :]]))
+        case ast.UnaryOp(op=ast.USub() | ast.Not() | ast.Invert()):
+            yield _Change(node, node.operand)
+            if isinstance(node.operand, ast.Constant):
+                return
+        case ast.Constant(value=bool(value)):
+            yield _Change(node, ast.Constant(not value))
+        case ast.Constant(value=int(value) | float(value)) if value:
+            yield _Change(node, ast.UnaryOp(ast.USub(), node))
+        case ast.If(test=test) | ast.While(test=test) | ast.IfExp(test=test) if not isinstance(test, (ast.Compare, ast.UnaryOp)):
+            yield _Change(test, ast.UnaryOp(ast.Not(), test))
+    for name, field in ast.iter_fields(node):
+        skipped = name in ("annotation", "returns", "decorator_list", "type_params") or (
+            isinstance(node, ast.keyword) and node.arg in ("axis", "axes", "ndim")
+        )
+        for child in field if isinstance(field, list) else [field]:
+            if isinstance(child, ast.AST) and not skipped:
+                yield from changes(child)
+
+
+def _with(node, **fields):
+    found = copy.copy(node)
+    for name, value in fields.items():
+        setattr(found, name, value)
+    return found
+
+
+def mutants_of(file: str) -> list[Mutant]:
+    """All mutants of a file of the checkout."""
+    source = (ROOT / file).read_bytes()
+    starts = np.cumsum([0, *(len(line) for line in source.splitlines(keepends=True))])
+    found, tests = [], tests_of(file)
+    for node, into in changes(ast.parse(source)):
+        start, stop = starts[node.lineno - 1] + node.col_offset, starts[node.end_lineno - 1] + node.end_col_offset
+        after = ast.unparse(into)
+        if isinstance(node, ast.expr):
+            after = f"({after})"
+        found.append(Mutant(file, node.lineno, source[start:stop].decode(), after, int(start), int(stop), tests))
+    return found
+
+
+def tests_of(file: str) -> list[str]:
+    """The test files of a source file's area: those that name it or what it registers, and its folder's."""
+    names = {Path(file).stem, *re.findall(r'@(?:diagnoser|trainer)\(\s*"(\w+)"', (ROOT / file).read_text())}
+    module = file.removesuffix(".py").replace("/", ".")
+    words = re.compile(rf"\b{re.escape(module)}\b|import [^\n]*\b{Path(file).stem}\b|\"({'|'.join(names)})\b")
+    area = next(tests for folder, tests in AREAS.items() if file.startswith(folder))
+    naming = {path.stem.removeprefix("test_") for path in (ROOT / "tests").glob("test_*.py") if words.search(path.read_text())}
+    return [f"tests/test_{name}.py" for name in sorted({*(naming - ELSEWHERE), *area})]
+
+
+def draw(seed: int, count: int) -> list[Mutant]:
+    """So many mutants at random, at most a third of them in compiled files."""
+    files = [
+        str(path.relative_to(ROOT)) for place in MUTATED
+        for path in ([ROOT / place] if place.endswith(".py") else sorted((ROOT / place).glob("*.py")))
+    ]  # fmt: skip
+    every = [mutant for file in files for mutant in mutants_of(file)]
+    compiled = {file for file in files if re.search(r"@(compiled|helper|numba\.njit)", (ROOT / file).read_text())}
+    found, dear = [], 0
+    for i in np.random.default_rng(seed).permutation(len(every)):
+        if len(found) == count:
+            break
+        if every[i].file in compiled:
+            if 3 * (dear + 1) > count:
+                continue
+            dear += 1
+        found.append(every[i])
+    return found
+
+
+def pytest(tree: Path, tests: list[str], timeout: float) -> tuple[bool, str, float]:
+    """Whether tests fail, the first that does, and the seconds that they take."""
+    environment = os.environ | {
+        "PYTHONPATH": str(tree), "FDI_GYM_CACHE_DIR": str(tree.parent / "cache"), "PYTHONDONTWRITEBYTECODE": "1",
+        "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
+    }  # fmt: skip
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "--tb=no", "-p", "no:cacheprovider",
+               "-p", "no:xdist", "-rfE", *tests]  # fmt: skip
+    begun = time.monotonic()
+    try:
+        done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, timeout=timeout, check=False)
+    except subprocess.TimeoutExpired:
+        return True, "time", time.monotonic() - begun
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
+    by = failed.group(1) if failed else done.stdout[-300:] + done.stderr[-300:] if done.returncode else ""
+    return done.returncode != 0, by, time.monotonic() - begun
+
+
+def copy_tree(tree: Path, only: str = ".") -> None:
+    """Copy the files under version control, and new ones, to the work folder."""
+    listed = subprocess.run(["git", "ls-files", "-co", "--exclude-standard", only], cwd=ROOT, capture_output=True, check=True)
+    for name in listed.stdout.decode().splitlines():
+        if (ROOT / name).is_file():
+            (tree / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, tree / name)
+
+
+def run(work: Path, seed: int, count: int, again: bool) -> list[Mutant]:
+    """Draw mutants, or go on with those that are drawn, and write down after each what became of it."""
+    tree, file = work / "tree", work / "mutants.json"
+    if file.exists():
+        mutants = msgspec.json.decode(file.read_bytes(), type=list[Mutant])
+        copy_tree(tree, "tests")
+    else:
+        copy_tree(tree)
+        mutants = draw(seed, count)
+        write_whole(file, msgspec.json.encode(mutants))
+    times, healthy = work / "times.json", {}
+    healthy = msgspec.json.decode(times.read_bytes()) if times.exists() else {}
+    for i, mutant in enumerate(mutants):
+        if mutant.killed or (mutant.killed is False and not again):
+            continue
+        for test in mutant.tests:  # without a change all pass
+            if test not in healthy:
+                failed, by, healthy[test] = pytest(tree, [test], 3600)
+                if failed:
+                    raise SystemExit(f"{test} fails without any change: {by}")
+                print(f"{test}: {healthy[test]:.0f} s", flush=True)
+                write_whole(times, msgspec.json.encode(healthy))
+        path = tree / mutant.file
+        source, stat = path.read_bytes(), path.stat()
+        try:
+            path.write_bytes(source[: mutant.start] + mutant.after.encode() + source[mutant.stop :])
+            tests = sorted(mutant.tests, key=lambda name: healthy[name])
+            limit = 300 + 5 * sum(healthy[name] for name in tests)
+            mutant.killed, mutant.by, mutant.seconds = pytest(tree, tests, limit)
+        finally:
+            path.write_bytes(source)
+            os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))  # numba's cache looks at it
+        write_whole(file, msgspec.json.encode(mutants))
+        print(i, mutant.file, mutant.line, mutant.before[:60], "->", mutant.after[:60], mutant.by or "SURVIVED",
+              f"{mutant.seconds:.0f} s", flush=True)  # fmt: skip
+    return mutants
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--count", type=int, default=100)
+    parser.add_argument("--work", type=Path, default=Path("runs/mutants"))
+    parser.add_argument("--survivors", action="store_true")
+    arguments = parser.parse_args()
+    mutants = run(arguments.work.resolve(), arguments.seed, arguments.count, arguments.survivors)
+    rows = [[f"{m.file}:{m.line}", f"`{' '.join(m.before.split())}`", f"`{m.after}`", m.by.rpartition("/")[2] or "nothing"]
+            for m in mutants]  # fmt: skip
+    print(markdown(["place", "before", "after", "killed by"], rows))
+    print(f"{sum(bool(m.killed) for m in mutants)} of {len(mutants)} killed")
+
+
+if __name__ == "__main__":
+    main()
