@@ -7,13 +7,15 @@ A mutant is one change of a syntax tree: an arithmetic operator becomes its inve
 that say along which axis, annotations, decorators and messages of errors are left alone. At most a third of the mutants are
 drawn in files that numba compiles, since each of those is compiled anew.
 
-The tests are those that name the changed module or the methods it registers, and those of its folder (`AREAS`). The
+The tests are those that name the changed module or the methods it registers, the conformance of these, and those of its
+folder (`AREAS`); each passes without a change. The
 sources are copied to the work folder and stay as they were drawn; the tests are those of the checkout at each start. A run
 that was killed goes on; `--survivors` runs those again that no test killed, for tests written since.
 """
 
 import argparse
 import ast
+import contextlib
 import copy
 import os
 import re
@@ -28,6 +30,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from fdi_gym.diagnosis import diagnosers
 from fdi_gym.files import write_whole
 from fdi_gym.tables import markdown
 
@@ -39,7 +42,7 @@ MUTATED = [
 AREAS = {  # what tests a folder as a whole, beside the tests that name a file
     "fdi_gym/estimation": ["gaussian", "general_filters", "general_methods"],
     "fdi_gym/diagnosis": ["guard", "shells", "knowledge", "conformance"],
-    "baselines/filters": ["general_methods", "conformance"],
+    "baselines/filters": ["general_methods"],
     "baselines/learned": ["learned", "reinforcement"],
     "fdi_gym": ["metrics", "evaluation", "suites"],
 }
@@ -90,7 +93,9 @@ def changes(node: ast.AST) -> Iterator[_Change]:
             yield _Change(node, ast.Constant(not value))
         case ast.Constant(value=int(value) | float(value)) if value:
             yield _Change(node, ast.UnaryOp(ast.USub(), node))
-        case ast.If(test=test) | ast.While(test=test) | ast.IfExp(test=test) if not isinstance(test, (ast.Compare, ast.UnaryOp)):
+        case ast.If(test=test) | ast.While(test=test) | ast.IfExp(test=test) if not isinstance(
+            test, (ast.Compare, ast.UnaryOp)
+        ):
             yield _Change(test, ast.UnaryOp(ast.Not(), test))
     for name, field in ast.iter_fields(node):
         skipped = name in ("annotation", "returns", "decorator_list", "type_params") or (
@@ -123,13 +128,18 @@ def mutants_of(file: str) -> list[Mutant]:
 
 
 def tests_of(file: str) -> list[str]:
-    """The test files of a source file's area: those that name it or what it registers, and its folder's."""
-    names = {Path(file).stem, *re.findall(r'@(?:diagnoser|trainer)\(\s*"(\w+)"', (ROOT / file).read_text())}
-    module = file.removesuffix(".py").replace("/", ".")
-    words = re.compile(rf"\b{re.escape(module)}\b|import [^\n]*\b{Path(file).stem}\b|\"({'|'.join(names)})\b")
+    """The tests of a source file's area: the files that name it or what it registers, conformance, and its folder's."""
+    text = (ROOT / file).read_text()
+    names = re.findall(r'@(?:diagnoser|trainer)\(\s*"(\w+)"', text)
+    module, words = file.removesuffix(".py").replace("/", "."), "|".join([*names, Path(file).stem])
+    named = re.compile(rf'\b{re.escape(module)}\b|import [^\n]*\b{Path(file).stem}\b|"({words})\b')
     area = next(tests for folder, tests in AREAS.items() if file.startswith(folder))
-    naming = {path.stem.removeprefix("test_") for path in (ROOT / "tests").glob("test_*.py") if words.search(path.read_text())}
-    return [f"tests/test_{name}.py" for name in sorted({*(naming - ELSEWHERE), *area})]
+    naming = [path.stem.removeprefix("test_") for path in sorted((ROOT / "tests").glob("test_*.py"))
+              if named.search(path.read_text())]  # fmt: skip
+    files = [f"tests/test_{name}.py" for name in dict.fromkeys([*naming, *area]) if name not in {*ELSEWHERE, "conformance"}]
+    methods = sorted({*names} & {*diagnosers()}) or (["augmented_ekf"] if "conformance" in area else [])
+    same = f"tests/test_conformance.py -k test_diagnoser and ({' or '.join(f'{name}-' for name in methods)})"
+    return [*files, same] if methods else files
 
 
 def draw(seed: int, count: int) -> list[Mutant]:
@@ -152,31 +162,50 @@ def draw(seed: int, count: int) -> list[Mutant]:
     return found
 
 
-def pytest(tree: Path, tests: list[str], timeout: float) -> tuple[bool, str, float]:
-    """Whether tests fail, the first that does, and the seconds that they take."""
+def pytest(tree: Path, tests: str, timeout: float) -> tuple[str, float]:
+    """The first of some tests that fails, or nothing, and the seconds that they take."""
+    cache = tree.parent / "cache"
     environment = os.environ | {
-        "PYTHONPATH": str(tree), "FDI_GYM_CACHE_DIR": str(tree.parent / "cache"), "PYTHONDONTWRITEBYTECODE": "1",
-        "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
+        "PYTHONPATH": str(tree), "FDI_GYM_CACHE_DIR": str(cache), "PYTHONPYCACHEPREFIX": str(cache / "pyc"),
+        "PYTHONDONTWRITEBYTECODE": "", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
     }  # fmt: skip
+    file, _, chosen = tests.partition(" -k ")
     command = [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "--tb=no", "-p", "no:cacheprovider",
-               "-p", "no:xdist", "-rfE", *tests]  # fmt: skip
+               "-p", "no:xdist", "-rfE", file, *(["-k", chosen] if chosen else [])]  # fmt: skip
     begun = time.monotonic()
     try:
-        done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, timeout=timeout, check=False)
+        done = subprocess.run(
+            command, cwd=tree, env=environment, capture_output=True, text=True, timeout=timeout, check=False
+        )
     except subprocess.TimeoutExpired:
-        return True, "time", time.monotonic() - begun
+        return "time", time.monotonic() - begun
     failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
-    by = failed.group(1) if failed else done.stdout[-300:] + done.stderr[-300:] if done.returncode else ""
-    return done.returncode != 0, by, time.monotonic() - begun
+    by = failed.group(1) if failed else (done.stdout + done.stderr).strip()[-300:] if done.returncode else ""
+    return by, time.monotonic() - begun
 
 
 def copy_tree(tree: Path, only: str = ".") -> None:
     """Copy the files under version control, and new ones, to the work folder."""
-    listed = subprocess.run(["git", "ls-files", "-co", "--exclude-standard", only], cwd=ROOT, capture_output=True, check=True)
+    listed = subprocess.run(
+        ["git", "ls-files", "-co", "--exclude-standard", only], cwd=ROOT, capture_output=True, check=True
+    )
     for name in listed.stdout.decode().splitlines():
         if (ROOT / name).is_file():
             (tree / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, tree / name)
+
+
+@contextlib.contextmanager
+def changed(tree: Path, mutant: Mutant) -> Iterator[None]:
+    """A file with its change, and as it was afterwards."""
+    path = tree / mutant.file
+    source, stat = path.read_bytes(), path.stat()
+    try:
+        path.write_bytes(source[: mutant.start] + mutant.after.encode() + source[mutant.stop :])
+        yield
+    finally:
+        path.write_bytes(source)
+        os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))  # numba's cache looks at it
 
 
 def run(work: Path, seed: int, count: int, again: bool) -> list[Mutant]:
@@ -189,28 +218,24 @@ def run(work: Path, seed: int, count: int, again: bool) -> list[Mutant]:
         copy_tree(tree)
         mutants = draw(seed, count)
         write_whole(file, msgspec.json.encode(mutants))
-    times, healthy = work / "times.json", {}
-    healthy = msgspec.json.decode(times.read_bytes()) if times.exists() else {}
+    times = work / "times.json"
+    healthy: dict[str, float] = msgspec.json.decode(times.read_bytes()) if times.exists() else {}
     for i, mutant in enumerate(mutants):
         if mutant.killed or (mutant.killed is False and not again):
             continue
-        for test in mutant.tests:  # without a change all pass
-            if test not in healthy:
-                failed, by, healthy[test] = pytest(tree, [test], 3600)
-                if failed:
-                    raise SystemExit(f"{test} fails without any change: {by}")
-                print(f"{test}: {healthy[test]:.0f} s", flush=True)
+        mutant.killed, mutant.seconds = False, 0.0
+        for tests in sorted(mutant.tests, key=lambda tests: healthy.get(tests, 60.0)):
+            if tests not in healthy:
+                by, healthy[tests] = pytest(tree, tests, 3600)
+                if by:
+                    raise SystemExit(f"{tests} fails without any change: {by}")
+                print(f"{tests}: {healthy[tests]:.0f} s", flush=True)
                 write_whole(times, msgspec.json.encode(healthy))
-        path = tree / mutant.file
-        source, stat = path.read_bytes(), path.stat()
-        try:
-            path.write_bytes(source[: mutant.start] + mutant.after.encode() + source[mutant.stop :])
-            tests = sorted(mutant.tests, key=lambda name: healthy[name])
-            limit = 300 + 5 * sum(healthy[name] for name in tests)
-            mutant.killed, mutant.by, mutant.seconds = pytest(tree, tests, limit)
-        finally:
-            path.write_bytes(source)
-            os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))  # numba's cache looks at it
+            with changed(tree, mutant):
+                mutant.by, seconds = pytest(tree, tests, 300 + 5 * healthy[tests])
+            mutant.killed, mutant.seconds = bool(mutant.by), mutant.seconds + seconds
+            if mutant.killed:
+                break
         write_whole(file, msgspec.json.encode(mutants))
         print(i, mutant.file, mutant.line, mutant.before[:60], "->", mutant.after[:60], mutant.by or "SURVIVED",
               f"{mutant.seconds:.0f} s", flush=True)  # fmt: skip

@@ -9,5 +9,5 @@ import tyro
 WIDTH = 120  # of tables on the screen
 
 Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="METHOD")]
-SuiteName = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SUITE")]
+SuiteNames = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="SUITE")]
 PlantName = Annotated[str, tyro.conf.arg(metavar="PLANT")]
