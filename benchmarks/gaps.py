@@ -104,9 +104,11 @@ def study(plant, flights, samples, names, work):
         made = digest([provenance(name, plant, "standard", {}), flights, samples, FIRST, sorted(patterns)])
         path = work / f"{plant.id}-{name}-{made[:12]}.json"
         if not path.exists():
-            alarms = {pattern: int(run(diagnoser, obs).alarm.any(axis=1).sum()) for pattern, obs in patterns.items()}
-            right = [100 * float((run(diagnoser, hurt[pattern]).label == label).mean()) for pattern in ("whole", "all")]
-            write_whole(path, msgspec.json.encode(Found(alarms, (right[0], right[1]))))
+            said = run(diagnoser, np.concatenate([*patterns.values(), hurt["whole"], hurt["all"]]))
+            counts = said.alarm.any(axis=1).reshape(-1, flights).sum(axis=1).tolist()
+            right = 100 * (said.label.reshape(-1, *label.shape)[-2:] == label).mean(axis=(1, 2))
+            alarms = dict(zip(patterns, counts[:-2], strict=True))
+            write_whole(path, msgspec.json.encode(Found(alarms, (float(right[0]), float(right[1])))))
         yield name, msgspec.json.decode(path.read_bytes(), type=Found)
 
 

@@ -20,12 +20,13 @@ import copy
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -53,6 +54,26 @@ FLIPPED = {
     ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In, ast.And: ast.Or, ast.Or: ast.And,
 }  # fmt: skip
+
+
+FORKS = """
+import importlib, json, os, signal, sys
+for name in ("gymnasium", "hypothesis", "joblib", "msgspec", "numba", "pytest", "scipy.linalg", "scipy.special",
+             "scipy.stats", "stable_baselines3", "torch", "tqdm", "tyro"):
+    importlib.import_module(name)
+for line in sys.stdin:
+    limit, arguments = json.loads(line)
+    child = os.fork()
+    if not child:
+        said = os.open(sys.argv[1], os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
+        os.dup2(said, 1)
+        os.dup2(said, 2)
+        signal.alarm(limit)
+        status = sys.modules["pytest"].main(arguments)
+        sys.stdout.flush()
+        os._exit(status)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
 
 
 class Mutant(msgspec.Struct):
@@ -162,26 +183,35 @@ def draw(seed: int, count: int) -> list[Mutant]:
     return found
 
 
-def pytest(tree: Path, tests: str, timeout: float) -> tuple[str, float]:
-    """The first of some tests that fails, or nothing, and the seconds that they take."""
-    cache = tree.parent / "cache"
-    environment = os.environ | {
-        "PYTHONPATH": str(tree), "FDI_GYM_CACHE_DIR": str(cache), "PYTHONPYCACHEPREFIX": str(cache / "pyc"),
-        "PYTHONDONTWRITEBYTECODE": "", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
-    }  # fmt: skip
-    file, _, chosen = tests.partition(" -k ")
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "--tb=no", "-p", "no:cacheprovider",
-               "-p", "no:xdist", "-rfE", file, *(["-k", chosen] if chosen else [])]  # fmt: skip
-    begun = time.monotonic()
-    try:
-        done = subprocess.run(
-            command, cwd=tree, env=environment, capture_output=True, text=True, timeout=timeout, check=False
+class Tester:
+    """Runs tests in a tree. Each run is a fork of a process that has imported the libraries, and nothing of the tree."""
+
+    def __init__(self, tree: Path):
+        cache = tree.parent / "cache"
+        environment = os.environ | {
+            "PYTHONPATH": str(tree), "FDI_GYM_CACHE_DIR": str(cache), "PYTHONPYCACHEPREFIX": str(cache / "pyc"),
+            "PYTHONDONTWRITEBYTECODE": "", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
+        }  # fmt: skip
+        self.said = tree.parent / "said.txt"
+        command = [sys.executable, "-c", FORKS, str(self.said)]
+        self.process: Any = subprocess.Popen(
+            command, cwd=tree, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
-    except subprocess.TimeoutExpired:
-        return "time", time.monotonic() - begun
-    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
-    by = failed.group(1) if failed else (done.stdout + done.stderr).strip()[-300:] if done.returncode else ""
-    return by, time.monotonic() - begun
+
+    def first_failure(self, tests: str, limit: float) -> tuple[str, float]:
+        """The first of some tests that fails, or nothing, and the seconds that they take."""
+        file, _, chosen = tests.partition(" -k ")
+        arguments = ["-x", "-q", "--no-header", "--tb=no", "-p", "no:cacheprovider", "-p", "no:xdist", "-rfE", file,
+                     *(["-k", chosen] if chosen else [])]  # fmt: skip
+        begun = time.monotonic()
+        self.process.stdin.write(msgspec.json.encode([round(limit), arguments]).decode() + "\n")
+        self.process.stdin.flush()
+        status, said = int(self.process.stdout.readline()), self.said.read_text()
+        seconds = time.monotonic() - begun
+        if status in (0, 5):  # 5: there are none
+            return "", seconds
+        failed = re.search(r"^(?:FAILED|ERROR) (\S+)", said, re.MULTILINE)
+        return failed.group(1) if failed else "time" if status == -signal.SIGALRM else said.strip()[-300:], seconds
 
 
 def copy_tree(tree: Path, only: str = ".") -> None:
@@ -218,7 +248,7 @@ def run(work: Path, seed: int, count: int, again: bool) -> list[Mutant]:
         copy_tree(tree)
         mutants = draw(seed, count)
         write_whole(file, msgspec.json.encode(mutants))
-    times = work / "times.json"
+    tester, times = Tester(tree), work / "times.json"
     healthy: dict[str, float] = msgspec.json.decode(times.read_bytes()) if times.exists() else {}
     for i, mutant in enumerate(mutants):
         if mutant.killed or (mutant.killed is False and not again):
@@ -226,13 +256,13 @@ def run(work: Path, seed: int, count: int, again: bool) -> list[Mutant]:
         mutant.killed, mutant.seconds = False, 0.0
         for tests in sorted(mutant.tests, key=lambda tests: healthy.get(tests, 60.0)):
             if tests not in healthy:
-                by, healthy[tests] = pytest(tree, tests, 3600)
+                by, healthy[tests] = tester.first_failure(tests, 3600)
                 if by:
                     raise SystemExit(f"{tests} fails without any change: {by}")
                 print(f"{tests}: {healthy[tests]:.0f} s", flush=True)
                 write_whole(times, msgspec.json.encode(healthy))
             with changed(tree, mutant):
-                mutant.by, seconds = pytest(tree, tests, 300 + 5 * healthy[tests])
+                mutant.by, seconds = tester.first_failure(tests, 300 + 5 * healthy[tests])
             mutant.killed, mutant.seconds = bool(mutant.by), mutant.seconds + seconds
             if mutant.killed:
                 break
