@@ -8,7 +8,7 @@ that say along which axis, annotations, decorators and messages of errors are le
 drawn in files that numba compiles, since each of those is compiled anew.
 
 The tests are those that name the changed module or the methods it registers, the conformance of these, and those of its
-folder (`AREAS`); each passes without a change. The
+folder (`AREAS`); those that fail with a change pass without. The
 sources are copied to the work folder and stay as they were drawn; the tests are those of the checkout at each start. A run
 that was killed goes on; `--survivors` runs those again that no test killed, for tests written since.
 """
@@ -85,7 +85,7 @@ class Mutant(msgspec.Struct):
     after: str
     start: int  # of the text that changes, in bytes
     stop: int
-    tests: list[str]
+    tests: list[str] = []
     killed: bool | None = None  # None: not run yet
     by: str = ""
     seconds: float = 0.0
@@ -134,17 +134,17 @@ def _with(node, **fields):
     return found
 
 
-def mutants_of(file: str) -> list[Mutant]:
-    """All mutants of a file of the checkout."""
-    source = (ROOT / file).read_bytes()
+def of_source(file: str, source: bytes) -> list[Mutant]:
+    """All mutants of a source text."""
     starts = np.cumsum([0, *(len(line) for line in source.splitlines(keepends=True))])
-    found, tests = [], tests_of(file)
+    found = []
     for node, into in changes(ast.parse(source)):
-        start, stop = starts[node.lineno - 1] + node.col_offset, starts[node.end_lineno - 1] + node.end_col_offset
+        place: Any = node
+        start, stop = starts[place.lineno - 1] + place.col_offset, starts[place.end_lineno - 1] + place.end_col_offset
         after = ast.unparse(into)
         if isinstance(node, ast.expr):
             after = f"({after})"
-        found.append(Mutant(file, node.lineno, source[start:stop].decode(), after, int(start), int(stop), tests))
+        found.append(Mutant(file, place.lineno, source[start:stop].decode(), after, int(start), int(stop)))
     return found
 
 
@@ -169,7 +169,7 @@ def draw(seed: int, count: int) -> list[Mutant]:
         str(path.relative_to(ROOT)) for place in MUTATED
         for path in ([ROOT / place] if place.endswith(".py") else sorted((ROOT / place).glob("*.py")))
     ]  # fmt: skip
-    every = [mutant for file in files for mutant in mutants_of(file)]
+    every = [mutant for file in files for mutant in of_source(file, (ROOT / file).read_bytes())]
     compiled = {file for file in files if re.search(r"@(compiled|helper|numba\.njit)", (ROOT / file).read_text())}
     found, dear = [], 0
     for i in np.random.default_rng(seed).permutation(len(every)):
@@ -179,8 +179,9 @@ def draw(seed: int, count: int) -> list[Mutant]:
             if 3 * (dear + 1) > count:
                 continue
             dear += 1
+        every[i].tests = tests_of(every[i].file)
         found.append(every[i])
-    return found
+    return sorted(found, key=lambda mutant: (mutant.file in compiled, "learned" in mutant.file))  # the dear ones last
 
 
 class Tester:
@@ -221,21 +222,25 @@ def copy_tree(tree: Path, only: str = ".") -> None:
     )
     for name in listed.stdout.decode().splitlines():
         if (ROOT / name).is_file():
-            (tree / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(ROOT / name, tree / name)
+            copy_file(ROOT / name, tree / name)
+
+
+def copy_file(source: Path, target: Path) -> None:
+    """Copy a file with its time, which numba's cache looks at."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy2(source, target)
 
 
 @contextlib.contextmanager
-def changed(tree: Path, mutant: Mutant) -> Iterator[None]:
-    """A file with its change, and as it was afterwards."""
-    path = tree / mutant.file
-    source, stat = path.read_bytes(), path.stat()
+def changed(work: Path, mutant: Mutant) -> Iterator[None]:
+    """A file of the tree with its change, and as it was drawn afterwards."""
+    drawn, path = work / "drawn" / mutant.file, work / "tree" / mutant.file
+    source = drawn.read_bytes()
     try:
         path.write_bytes(source[: mutant.start] + mutant.after.encode() + source[mutant.stop :])
         yield
     finally:
-        path.write_bytes(source)
-        os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))  # numba's cache looks at it
+        copy_file(drawn, path)
 
 
 def run(work: Path, seed: int, count: int, again: bool) -> list[Mutant]:
@@ -244,8 +249,11 @@ def run(work: Path, seed: int, count: int, again: bool) -> list[Mutant]:
     if file.exists():
         mutants = msgspec.json.decode(file.read_bytes(), type=list[Mutant])
         copy_tree(tree, "tests")
+        for mutant in mutants:  # one may have been left by a run that was killed
+            copy_file(work / "drawn" / mutant.file, tree / mutant.file)
     else:
         copy_tree(tree)
+        copy_tree(work / "drawn")
         mutants = draw(seed, count)
         write_whole(file, msgspec.json.encode(mutants))
     tester, times = Tester(tree), work / "times.json"
@@ -254,15 +262,14 @@ def run(work: Path, seed: int, count: int, again: bool) -> list[Mutant]:
         if mutant.killed or (mutant.killed is False and not again):
             continue
         mutant.killed, mutant.seconds = False, 0.0
-        for tests in sorted(mutant.tests, key=lambda tests: healthy.get(tests, 60.0)):
-            if tests not in healthy:
+        for tests in sorted(mutant.tests, key=lambda tests: healthy.get(tests, np.inf)):
+            with changed(work, mutant):
+                mutant.by, seconds = tester.first_failure(tests, 300 + 5 * healthy.get(tests, 300.0))
+            if mutant.by and tests not in healthy:
                 by, healthy[tests] = tester.first_failure(tests, 3600)
                 if by:
                     raise SystemExit(f"{tests} fails without any change: {by}")
-                print(f"{tests}: {healthy[tests]:.0f} s", flush=True)
                 write_whole(times, msgspec.json.encode(healthy))
-            with changed(tree, mutant):
-                mutant.by, seconds = tester.first_failure(tests, 300 + 5 * healthy[tests])
             mutant.killed, mutant.seconds = bool(mutant.by), mutant.seconds + seconds
             if mutant.killed:
                 break
