@@ -1,6 +1,9 @@
 """False alarms and accuracy through gaps: every method that handles them, on every plant it runs on.
 
-    python benchmarks/gaps.py [PLANT ...] [--flights 40] [--samples 1200] [--methods NAME ...] [--page leaderboards/gaps.md]
+    python benchmarks/gaps.py [PLANT ...] [--flights 40 ...] [--samples 1200 ...] [--methods NAME ...]
+        [--page leaderboards/gaps.md] [--finished]
+
+Numbers of flights and samples are one for all plants or one for each; `--finished` makes the page of what is there.
 
 The same flights under each pattern of missing samples: none; three gaps of 1, 5, 10, 20 or 40 samples in everything; one
 sensor at every seventh sample; nothing at sample 0; all of these together. Healthy flights count those with any alarm;
@@ -92,8 +95,8 @@ def applicable(plant, names):
                 yield name, diagnoser
 
 
-def study(plant, flights, samples, names, work):
-    """What became of each method, by its name."""
+def study(plant, flights, samples, names, work, finished=False):
+    """What became of each method, by its name; with `finished` of those that are there."""
     scenarios = [draw(plant.process("standard"), FIRST + i) for i in range(flights)]
     healthy = simulate(plant, [s.without_faults() for s in scenarios]).obs[:, :samples]
     faulty = simulate(plant, scenarios)
@@ -103,6 +106,8 @@ def study(plant, flights, samples, names, work):
     for name, diagnoser in applicable(plant, names):
         made = digest([provenance(name, plant, "standard", {}), flights, samples, FIRST, sorted(patterns)])
         path = work / f"{plant.id}-{name}-{made[:12]}.json"
+        if not path.exists() and finished:
+            continue
         if not path.exists():
             said = run(diagnoser, np.concatenate([*patterns.values(), hurt["whole"], hurt["all"]]))
             counts = said.alarm.any(axis=1).reshape(-1, flights).sum(axis=1).tolist()
@@ -134,18 +139,19 @@ def section(plant, flights, samples, found):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("plants", nargs="*", default=list(plant_sources()))
-    parser.add_argument("--flights", type=int, default=40)
-    parser.add_argument("--samples", type=int, default=1200)
+    parser.add_argument("--flights", type=int, nargs="+", default=[40])
+    parser.add_argument("--samples", type=int, nargs="+", default=[1200])
     parser.add_argument("--methods", nargs="*", default=[])
     parser.add_argument("--work", type=Path, default=Path("runs/gaps"))
     parser.add_argument("--page", type=Path)
+    parser.add_argument("--finished", action="store_true")
     arguments = parser.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)
     parts = [INTRODUCTION.format(rate=RATE)]
-    for plant_id in arguments.plants:
+    for i, plant_id in enumerate(arguments.plants):
         found = {}
-        about = (arguments.flights, arguments.samples)
-        for name, mine in study(load_plant(plant_id), *about, arguments.methods, arguments.work):
+        about = [values[min(i, len(values) - 1)] for values in (arguments.flights, arguments.samples)]
+        for name, mine in study(load_plant(plant_id), *about, arguments.methods, arguments.work, arguments.finished):
             found[name] = mine
             print(plant_id, name, *mine.alarms.values(), *(f"{value:.1f}" for value in mine.right), flush=True)
         parts.append(section(plant_id, *about, found))

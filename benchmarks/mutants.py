@@ -8,14 +8,14 @@ that say along which axis, annotations, decorators and messages of errors are le
 drawn in files that numba compiles, since each of those is compiled anew.
 
 The tests are those that name the changed module or the methods it registers, the conformance of these, and those of its
-folder (`AREAS`); those that fail with a change pass without. The
-sources are copied to the work folder and stay as they were drawn; the tests are those of the checkout at each start. A run
-that was killed goes on; `--survivors` runs those again that no test killed, for tests written since.
+folder (`AREAS`); those that fail with a change pass without. Functions are changed in a running process first, so that most
+mutants cost seconds; what survives that, and what numba compiles, is run from files. The sources are copied to the work
+folder and stay as they were drawn; the tests are those of the checkout at each start. A run that was killed goes on;
+`--survivors` runs those again that no test killed, for tests written since.
 """
 
 import argparse
 import ast
-import contextlib
 import copy
 import os
 import re
@@ -24,7 +24,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,22 +57,48 @@ FLIPPED = {
 
 
 FORKS = """
-import importlib, json, os, signal, sys
+import gc, importlib, json, os, signal, sys, types
 for name in ("gymnasium", "hypothesis", "joblib", "msgspec", "numba", "pytest", "scipy.linalg", "scipy.special",
              "scipy.stats", "stable_baselines3", "torch", "tqdm", "tyro"):
     importlib.import_module(name)
+
+def codes(code):
+    yield code
+    for part in code.co_consts:
+        if isinstance(part, types.CodeType):
+            yield from codes(part)
+
+def own(code):
+    return code.co_code, code.co_names, [c for c in code.co_consts if not isinstance(c, types.CodeType)]
+
+def change(before, after):
+    pairs = list(zip(*(codes(compile(open(file).read(), before, "exec")) for file in (before, after)), strict=True))
+    if not all(old.co_flags & 1 for old, new in pairs if repr(own(old)) != repr(own(new))):
+        return False  # of a module's or class's own code, which has run
+    into = {old: new for old, new in pairs if old != new}
+    for function in gc.get_objects():
+        if isinstance(function, types.FunctionType) and function.__code__ in into:
+            function.__code__ = into[function.__code__]
+    return True
+
 for line in sys.stdin:
-    limit, arguments = json.loads(line)
-    child = os.fork()
+    how, limit, arguments, files = json.loads(line)
+    child = 0 if how == "here" else os.fork()
     if not child:
+        kept = os.dup(1)
         said = os.open(sys.argv[1], os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
         os.dup2(said, 1)
         os.dup2(said, 2)
         signal.alarm(limit)
-        status = sys.modules["pytest"].main(arguments)
+        status = sys.modules["pytest"].main(arguments) if not files or change(*files) else 99
+        signal.alarm(0)
         sys.stdout.flush()
-        os._exit(status)
-    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+        if how != "here":
+            os._exit(status)
+        os.dup2(kept, 1)
+    else:
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    print(int(status), flush=True)
 """
 
 
@@ -163,6 +189,11 @@ def tests_of(file: str) -> list[str]:
     return [*files, same] if methods else files
 
 
+def is_compiled(path: Path) -> bool:
+    """Whether numba compiles what a file holds."""
+    return bool(re.search(r"@(compiled|helper|numba\.njit)", path.read_text()))
+
+
 def draw(seed: int, count: int) -> list[Mutant]:
     """So many mutants at random, at most a third of them in compiled files."""
     files = [
@@ -170,7 +201,7 @@ def draw(seed: int, count: int) -> list[Mutant]:
         for path in ([ROOT / place] if place.endswith(".py") else sorted((ROOT / place).glob("*.py")))
     ]  # fmt: skip
     every = [mutant for file in files for mutant in of_source(file, (ROOT / file).read_bytes())]
-    compiled = {file for file in files if re.search(r"@(compiled|helper|numba\.njit)", (ROOT / file).read_text())}
+    compiled = {file for file in files if is_compiled(ROOT / file)}
     found, dear = [], 0
     for i in np.random.default_rng(seed).permutation(len(every)):
         if len(found) == count:
@@ -185,34 +216,65 @@ def draw(seed: int, count: int) -> list[Mutant]:
 
 
 class Tester:
-    """Runs tests in a tree. Each run is a fork of a process that has imported the libraries, and nothing of the tree."""
+    """Runs tests in the tree, each time in a fork of a process that has imported the libraries, and nothing of the tree.
 
-    def __init__(self, tree: Path):
-        cache = tree.parent / "cache"
+    A live one has run the tests before, so all is imported and built; a change of a function is then made in its memory.
+    What it had kept of the unchanged code it keeps: that no test fails there says nothing.
+    """
+
+    def __init__(self, work: Path, live: bool):
+        cache = work / "cache"
         environment = os.environ | {
-            "PYTHONPATH": str(tree), "FDI_GYM_CACHE_DIR": str(cache), "PYTHONPYCACHEPREFIX": str(cache / "pyc"),
+            "PYTHONPATH": str(work / "tree"), "FDI_GYM_CACHE_DIR": str(cache), "PYTHONPYCACHEPREFIX": str(cache / "pyc"),
             "PYTHONDONTWRITEBYTECODE": "", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
         }  # fmt: skip
-        self.said = tree.parent / "said.txt"
+        self.work, self.said, self.live = work, work / f"said-{live}.txt", live
+        self.passed: dict[str, bool] = {}
         command = [sys.executable, "-c", FORKS, str(self.said)]
         self.process: Any = subprocess.Popen(
-            command, cwd=tree, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            command, cwd=work / "tree", env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
 
-    def first_failure(self, tests: str, limit: float) -> tuple[str, float]:
-        """The first of some tests that fails, or nothing, and the seconds that they take."""
+    def _run(self, how: str, tests: str, limit: float, files: Sequence[Path] = ()) -> str:
         file, _, chosen = tests.partition(" -k ")
         arguments = ["-x", "-q", "--no-header", "--tb=no", "-p", "no:cacheprovider", "-p", "no:xdist", "-rfE", file,
                      *(["-k", chosen] if chosen else [])]  # fmt: skip
-        begun = time.monotonic()
-        self.process.stdin.write(msgspec.json.encode([round(limit), arguments]).decode() + "\n")
+        request = [how, round(limit), arguments, [str(file) for file in files]]
+        self.process.stdin.write(msgspec.json.encode(request).decode() + "\n")
         self.process.stdin.flush()
         status, said = int(self.process.stdout.readline()), self.said.read_text()
-        seconds = time.monotonic() - begun
-        if status in (0, 5):  # 5: there are none
-            return "", seconds
+        if status in (0, 5, 99):  # 5: there are none
+            return ""
         failed = re.search(r"^(?:FAILED|ERROR) (\S+)", said, re.MULTILINE)
-        return failed.group(1) if failed else "time" if status == -signal.SIGALRM else said.strip()[-300:], seconds
+        return failed.group(1) if failed else "time" if status == -signal.SIGALRM else said.strip()[-300:] or "a crash"
+
+    def passes(self, tests: str) -> bool:
+        """Whether tests pass without a change, where they will be run with one."""
+        if tests not in self.passed:
+            by = self._run("here", tests, 3600) if self.live else ""
+            by = by or self._run("fork", tests, 3600)
+            self.passed[tests] = not by
+            print(f"without a change: {tests}: {by or 'passes'}", flush=True)
+        return self.passed[tests]
+
+    def first_failure(self, mutant: Mutant, tests: str) -> str:
+        """The first of some tests that fails with a change, or nothing."""
+        drawn, path = self.work / "drawn" / mutant.file, self.work / "tree" / mutant.file
+        source = drawn.read_bytes()
+        after = source[: mutant.start] + mutant.after.encode() + source[mutant.stop :]
+        limit = 900 if self.live else 1800
+        if self.live:
+            changed = self.work / "changed.py"
+            changed.write_bytes(after)
+            return self._run("fork", tests, limit, (path, changed)) if self.passes(tests) else ""
+        try:
+            path.write_bytes(after)
+            by = self._run("fork", tests, limit)
+        finally:
+            copy_file(drawn, path)
+        if by and not self.passes(tests):
+            raise SystemExit(f"{tests} fail without any change")
+        return by
 
 
 def copy_tree(tree: Path, only: str = ".") -> None:
@@ -231,18 +293,6 @@ def copy_file(source: Path, target: Path) -> None:
     shutil.copy2(source, target)
 
 
-@contextlib.contextmanager
-def changed(work: Path, mutant: Mutant) -> Iterator[None]:
-    """A file of the tree with its change, and as it was drawn afterwards."""
-    drawn, path = work / "drawn" / mutant.file, work / "tree" / mutant.file
-    source = drawn.read_bytes()
-    try:
-        path.write_bytes(source[: mutant.start] + mutant.after.encode() + source[mutant.stop :])
-        yield
-    finally:
-        copy_file(drawn, path)
-
-
 def run(work: Path, seed: int, count: int, again: bool) -> list[Mutant]:
     """Draw mutants, or go on with those that are drawn, and write down after each what became of it."""
     tree, file = work / "tree", work / "mutants.json"
@@ -256,23 +306,14 @@ def run(work: Path, seed: int, count: int, again: bool) -> list[Mutant]:
         copy_tree(work / "drawn")
         mutants = draw(seed, count)
         write_whole(file, msgspec.json.encode(mutants))
-    tester, times = Tester(tree), work / "times.json"
-    healthy: dict[str, float] = msgspec.json.decode(times.read_bytes()) if times.exists() else {}
+    quick, sure = Tester(work, live=True), Tester(work, live=False)
     for i, mutant in enumerate(mutants):
         if mutant.killed or (mutant.killed is False and not again):
             continue
-        mutant.killed, mutant.seconds = False, 0.0
-        for tests in sorted(mutant.tests, key=lambda tests: healthy.get(tests, np.inf)):
-            with changed(work, mutant):
-                mutant.by, seconds = tester.first_failure(tests, 300 + 5 * healthy.get(tests, 300.0))
-            if mutant.by and tests not in healthy:
-                by, healthy[tests] = tester.first_failure(tests, 3600)
-                if by:
-                    raise SystemExit(f"{tests} fails without any change: {by}")
-                write_whole(times, msgspec.json.encode(healthy))
-            mutant.killed, mutant.seconds = bool(mutant.by), mutant.seconds + seconds
-            if mutant.killed:
-                break
+        begun, compiled = time.monotonic(), is_compiled(work / "drawn" / mutant.file)
+        tries = ((tester, tests) for tester in ((sure,) if compiled else (quick, sure)) for tests in mutant.tests)
+        mutant.by = next((by for tester, tests in tries if (by := tester.first_failure(mutant, tests))), "")
+        mutant.killed, mutant.seconds = bool(mutant.by), time.monotonic() - begun
         write_whole(file, msgspec.json.encode(mutants))
         print(i, mutant.file, mutant.line, mutant.before[:60], "->", mutant.after[:60], mutant.by or "SURVIVED",
               f"{mutant.seconds:.0f} s", flush=True)  # fmt: skip
