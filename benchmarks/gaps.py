@@ -14,6 +14,7 @@ of what made it, so that a run goes on where it was killed.
 
 import argparse
 import os
+import sys
 from pathlib import Path
 
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -37,8 +38,8 @@ GAPS = (1, 5, 10, 20, 40)  # samples
 FIRST = 4_000_000  # seed; neither test nor validation nor training flights
 INTRODUCTION = """# Through gaps
 
-Written by `python benchmarks/gaps.py --page leaderboards/gaps.md`, for the methods that handle missing samples themselves:
-so many healthy flights of the standard process had an alarm, whole and under each pattern of missing samples: three gaps of
+Written by `python benchmarks/gaps.py {command}`, of methods that handle missing
+samples themselves; those that are not named were not run. So many healthy flights of the standard process had an alarm, whole and under each pattern of missing samples: three gaps of
 1, 5, 10, 20 or 40 samples in everything, one sensor at every seventh sample, nothing at sample 0, all of these together. A
 method is calibrated so that {rate:.0%} of the healthy flights alarm. "!" marks more flights than a method with that rate, or
 with its own without gaps where that is higher, has in 97.5 % of the cases. The last columns are the share of right labels
@@ -147,7 +148,7 @@ def main():
     parser.add_argument("--finished", action="store_true")
     arguments = parser.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)
-    parts = [INTRODUCTION.format(rate=RATE)]
+    parts = [INTRODUCTION.format(rate=RATE, command=" ".join(sys.argv[1:]))]
     for i, plant_id in enumerate(arguments.plants):
         found = {}
         about = [values[min(i, len(values) - 1)] for values in (arguments.flights, arguments.samples)]
