@@ -39,8 +39,9 @@ FIRST = 4_000_000  # seed; neither test nor validation nor training flights
 INTRODUCTION = """# Through gaps
 
 Written by `python benchmarks/gaps.py {command}`, of methods that handle missing
-samples themselves; those that are not named were not run. So many healthy flights of the standard process had an alarm, whole
-and under each pattern of missing samples: three gaps of 1, 5, 10, 20 or 40 samples in everything, one sensor at every seventh sample, nothing at sample 0, all of these together. A
+samples themselves; those that are not named were not run. So many healthy flights of the standard process had an alarm,
+whole and under each pattern of missing samples: three gaps of 1, 5, 10, 20 or 40 samples in everything, one sensor at every
+seventh sample, nothing at sample 0, all of these together. A
 method is calibrated so that {rate:.0%} of the healthy flights alarm. "!" marks more flights than a method with that rate, or
 with its own without gaps where that is higher, has in 97.5 % of the cases. The last columns are the share of right labels
 in as many flights with their faults, whole and with all gaps together.
