@@ -227,6 +227,16 @@ class _Plan:
             self.failure = error
 
 
+def check_jobs(jobs: int) -> None:
+    """Check a number of worker processes.
+
+    Raises:
+        ValueError: It is out of range.
+    """
+    if jobs != -1 and jobs < 1:
+        raise ValueError(f"jobs is 1 or more, or -1 for one per core, not {jobs}")
+
+
 def evaluate(
     suite: AnySuite,
     names: Sequence[str],
@@ -253,8 +263,7 @@ def evaluate(
             of range.
         OSError: A block cannot be written; those that are finished stay.
     """
-    if jobs != -1 and jobs < 1:
-        raise ValueError(f"jobs is 1 or more, or -1 for one per core, not {jobs}")
+    check_jobs(jobs)
     if block < 1:
         raise ValueError(f"a block has 1 episode or more, not {block}")
     plant = suite.build()

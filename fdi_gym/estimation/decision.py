@@ -13,7 +13,8 @@ A rule is a pair of functions, `start(n)` and `step(state, k, reading, informed)
 
 `fdi_gym.estimation.channels` has one for filters whose estimate has an entry for each fault.
 
-A sample at which no sensor reported says nothing, and no counter moves.
+A sample at which no sensor reported says nothing, and no counter moves. After a gap `by_labels` waits until the estimate is
+about as sure as before it: what a held command did to it while nothing was measured is no evidence of a fault.
 """
 
 from __future__ import annotations
@@ -164,11 +165,26 @@ def glr(windows: tuple[int, ...] = (2, 5, 10, 20, 40)) -> Statistic:
 
 STATISTICS: dict[str, Callable[[], Statistic]] = {"chi-square": chi_square, "cusum": cusum, "glr": glr}
 DECISIONS = ("distance", "thresholds", *STATISTICS)
+SURE_AGAIN = 1.2  # times the variance before a gap
 QUARTER = 0.25  # of a typical fault: what LEAST is in the fixed metric of "thresholds"
 
 
 # ---------------------------------------------------------------------------------------------------------------
 # Rules
+
+
+class Waiting(NamedTuple):
+    """For an estimate that is as sure again as it was before a gap."""
+
+    still: Array  # (n,) bool
+    variance: Array  # (n, p) of the estimate when a sensor last reported and nothing was waited for
+
+    def after(self, informed: Array, variance: Array) -> Waiting:
+        """After a sample at which sensors reported or did not."""
+        if informed.all() and not self.still.any():
+            return Waiting(self.still, variance)
+        still = ~informed | (self.still & (variance > SURE_AGAIN * self.variance).any(axis=1))
+        return Waiting(still, np.where(still[:, None], self.variance, variance))
 
 
 def by_labels(
@@ -202,8 +218,8 @@ def by_labels(
     lengths = np.array([after.rise, after.switch, after.release, after.same, after.warmup], np.int64)
     none, labels, (h, _, f) = np.zeros(0), len(plant.labels), sets.direction.shape
 
-    def start(n: int) -> Any:
-        return np.zeros((n, 5), np.int64), None  # the automata, and the statistic
+    def start(n: int) -> Any:  # the automata, the statistic, and what is waited for
+        return np.zeros((n, 5), np.int64), None, Waiting(np.zeros(n, bool), np.full((n, p), np.inf))
 
     def costs(r: Reading) -> tuple[Array, Array]:
         assert r.z is not None
@@ -214,8 +230,11 @@ def by_labels(
         return cost, at
 
     def step(state: Any, k: Array, r: Reading, informed: Array) -> tuple[Any, Verdict]:
-        declared, tested = state
+        declared, tested, waiting = state
         n, rise = len(k), None
+        if r.P is not None:
+            waiting = waiting.after(informed, np.diagonal(r.P, axis1=1, axis2=2))
+            informed = informed & ~waiting.still
         if statistic is not None:
             tested = statistic.start(n, r.nu.shape[1] if r.nu is not None else m) if tested is None else tested
             tested, rise = statistic.step(tested, r, informed & (k > after.warmup))
@@ -236,7 +255,7 @@ def by_labels(
             label_kernels.judge(contiguous(r.z), P, excess, *sets, *told, cost, at)
         if on_line and at is not None:
             z = (sets.points(at) * (sets.labels == label[:, None])[..., None]).sum(axis=1)
-        return (following, tested), Verdict(alarm, label, z, Evidence(cost, rise))
+        return (following, tested, waiting), Verdict(alarm, label, z, Evidence(cost, rise))
 
     return Rule(start, step)
 
