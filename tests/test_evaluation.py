@@ -251,7 +251,7 @@ def test_command_line_end_to_end(capsys, small, tmp_path, monkeypatch):
     shown = capsys.readouterr().out
     assert "| two_stage_kf " in shown
     assert "rudder stuck" in shown
-    cli.main(["verify", *map(str, (results / "small").glob("*.json"))])
+    cli.main(["verify", *map(str, (results / "small").glob("*.json")), "--jobs", "1"])
     assert capsys.readouterr().out.count("same outcomes") == 2
     pages.mkdir()
     cli.main(["leaderboard", "--results", str(results), "--pages", str(pages)])

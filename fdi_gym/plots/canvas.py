@@ -39,7 +39,7 @@ class Canvas:
             heights.append(label_height(plant))
         if task in ("identification", "diagnosis"):
             heights += [ENTRIES] * math.ceil(entries / ACROSS)
-        if task == "scenario":
+        if task in ("scenario", "modes"):
             heights.append(0.5 + 0.14 * len(plant.modes))
         size = (9.6, sum(heights) + 0.42 * (len(heights) - 1) + 0.95)
         if window:
@@ -54,7 +54,7 @@ class Canvas:
             self.figure = Figure(figsize=size, dpi=100)
             FigureCanvasAgg(self.figure)
             self._show = None
-        names = [label.name for label in plant.labels] if task != "scenario" else list(plant.mode_names)
+        names = [label.name for label in plant.labels] if task not in ("scenario", "modes") else list(plant.mode_names)
         wide = min(0.05 + 0.0078 * max(map(len, names)), 0.26) if task != "identification" else 0.06
         grid = self.figure.add_gridspec(
             len(heights), 1, height_ratios=heights, left=0.06, right=0.985, top=1 - 0.55 / size[1], bottom=0.42 / size[1],
@@ -116,6 +116,13 @@ class Canvas:
             self.answer.step(t, label, where="post", color=palette.INK, lw=1.1, zorder=4)
             label_ticks(self.answer, [entry.name for entry in plant.labels])
             plain(self.answer, "label")
+        if self.task == "modes":
+            row = np.arange(len(plant.modes))
+            told = np.array([a for _, a in declared], bool).reshape(-1, len(row))
+            self.answer.plot(at, np.where(told, row, np.nan), "s", ms=4, mew=0, color=SAID, zorder=2)
+            self.answer.plot(t, np.where(plant.modes_of(label), row, np.nan), color=palette.INK, lw=1.1, zorder=4)
+            label_ticks(self.answer, plant.mode_names)
+            plain(self.answer, "fault modes")
         if self.entries is not None:
             first = int(self.task == "diagnosis")
             for j, (axis, signal) in enumerate(zip(self.entries, plant.estimated, strict=True)):
