@@ -19,7 +19,7 @@ from fdi_gym.evaluation import applicable, evaluate
 from fdi_gym.files import pretty, read_json, write_whole
 from fdi_gym.leaderboard import read_rows
 from fdi_gym.row import Row, row_path, write_rows
-from fdi_gym.suite import Suite, load_suite, suite_names
+from fdi_gym.suite import AnySuite, load_suite, suite_names
 from fdi_gym.tables import clairvoyant, markdown, plain
 
 KINDS = ("standard", "hard")
@@ -78,12 +78,12 @@ class Arguments:
     """The page; the figures of the consistency lie beside it in grid.json."""
 
 
-def consistency_piece(suite: Suite, name: str) -> dict[str, Any]:
+def consistency_piece(suite: AnySuite, name: str) -> dict[str, Any]:
     """NIS and NEES of one filter on one suite's plant and process."""
     return measure(suite.build(), suite.process, name)
 
 
-def reasons_of(suite: Suite) -> dict[str, str]:
+def reasons_of(suite: AnySuite) -> dict[str, str]:
     """Why the methods that cannot run on a suite's plant cannot, in the code's words."""
     return applicable(suite, suite.build(), list(diagnosers()))[1]
 
