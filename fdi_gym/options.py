@@ -54,9 +54,7 @@ class Options(msgspec.Struct, kw_only=True, omit_defaults=True, forbid_unknown_f
             plant = with_simultaneous(plant)
         if self.feedback == "healthy":
             plant = dataclasses.replace(plant, healthy_feedback=True)
-        lasting = {
-            name: value for name, value in given.items() if name in ("sensor_faults", "simultaneous", "feedback", "delays")
-        }
+        lasting = {name: value for name, value in given.items() if name in LASTING}
         regular = with_sampling(plant, Sampling(delays=self.delays)) if self.delays else plant
         regular = dataclasses.replace(regular, options={**plant.options, **lasting}) if lasting else regular
         if given == lasting:

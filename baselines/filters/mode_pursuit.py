@@ -30,7 +30,7 @@ class Lines:
         self.offset = np.array([mode.offset for mode in plant.modes])  # (modes, p)
         self.direction = np.array([mode.direction for mode in plant.modes])  # (modes, p)
 
-    def pursue(self, z: Array, I: Array, threshold: Array) -> tuple[Array, Array, Array]:  # noqa: E741
+    def pursue(self, z: Array, I: Array, threshold: Array) -> tuple[Array, Array]:  # noqa: E741
         """Modes that explain z.
 
         Args:
@@ -39,8 +39,7 @@ class Lines:
             threshold: What a mode must gain (modes,).
 
         Returns:
-            How much each gained when it was added, 0 for those that were not (n, modes); the gain of each alone (n, modes);
-            which were added first (n,).
+            How much each gained when it was added, 0 for those that were not (n, modes), and the gain of each alone.
         """
         n, modes = len(z), len(self.offset)
         gained, alone = np.zeros((n, modes)), np.zeros((n, modes))
@@ -70,7 +69,7 @@ class Lines:
             left = np.where(going[:, None], left - self.offset[best], left)
             cost = np.where(going, cost - most, cost)
             chosen = np.concatenate([chosen, np.where(going[:, None], self.direction[best], 0.0)[:, None]], axis=1)
-        return gained, alone, np.argmax(gained, axis=1)
+        return gained, alone
 
 
 def by_modes(plant: Plant, calibration: Calibration) -> Rule:
@@ -82,7 +81,8 @@ def by_modes(plant: Plant, calibration: Calibration) -> Rule:
     calibration.penalties(plant)
     lines, after, modes = Lines(plant), calibration.persistence, len(plant.modes)
     threshold = np.array([calibration.thresholds.get(mode.name, LEAST) for mode in plant.modes])
-    single = np.array([plant.label_of(frozenset({m.name})) if _has(plant, m.name) else -1 for m in plant.modes])
+    sets = plant.modes_of(np.arange(len(plant.labels)))
+    single = _labels(sets, np.eye(modes, dtype=bool))
     p = len(plant.estimated)
     excess = np.zeros((p, p)) if calibration.excess is None else calibration.excess
 
@@ -90,7 +90,7 @@ def by_modes(plant: Plant, calibration: Calibration) -> Rule:
         assert r.z is not None
         assert r.P is not None
         n = len(k)
-        gained, alone, _ = lines.pursue(r.z, np.linalg.inv(r.P + excess), threshold)
+        gained, alone = lines.pursue(r.z, np.linalg.inv(r.P + excess), threshold)
         if r.gain is not None:
             of_mode = np.where(single >= 0, r.gain[:, np.maximum(single, 0)], 0.0)
             gained = np.maximum(gained, np.where(of_mode > threshold, of_mode, 0.0))
@@ -100,25 +100,18 @@ def by_modes(plant: Plant, calibration: Calibration) -> Rule:
         acts = s.label > 0
         cost = np.zeros((n, len(plant.labels)))
         cost[:, single[single >= 0]] = -alone[:, single >= 0]
-        label = np.array([_label(plant, row, strength, single) for row, strength in zip(acts, alone, strict=True)], np.int64)
+        strongest = single[np.argmax(np.where(acts & (single >= 0), alone, -1.0), axis=1)]
+        label = _labels(sets, acts)
+        label = np.where(label >= 0, label, np.maximum(strongest, 0))
         return s, Verdict(np.any(acts, axis=1), label, evidence=Evidence(cost), signals={"modes": acts})
 
     return Rule(lambda n: undeclared((n, modes)), step)
 
 
-def _has(plant: Plant, mode: str) -> bool:
-    return any(label.modes == {mode} for label in plant.labels)
-
-
-def _label(plant: Plant, acts: Array, strength: Array, single: Array) -> int:
-    """The label of a set of modes, or that of its strongest one."""
-    if not acts.any():
-        return 0
-    names = frozenset(mode.name for mode, on in zip(plant.modes, acts, strict=True) if on)
-    for index, label in enumerate(plant.labels):
-        if label.modes == names:
-            return index
-    return max(int(single[np.argmax(np.where(acts & (single >= 0), strength, -1.0))]), 0)
+def _labels(sets: Array, acts: Array) -> Array:
+    """The labels (n,) whose sets (labels, modes) are the modes that act (n, modes), all bool; -1 where there is none."""
+    same = (acts[:, None] == sets).all(axis=2)
+    return np.where(same.any(axis=1), same.argmax(axis=1), -1)
 
 
 @diagnoser("mode_pursuit_ekf", "The augmented EKF, its estimate explained by as few fault modes as it takes")

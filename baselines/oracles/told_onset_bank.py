@@ -68,22 +68,17 @@ def rows(plant: Plant, belief: Belief) -> Rows:
     wide[: len(labels), : offset.shape[1]] = direction
     m0, M0 = np.concatenate([b.m0, np.zeros((more, f))]), np.concatenate([b.M0, np.zeros((more, f, f))])
     R, Q = np.tile(belief.R, (len(label), 1, 1)), np.concatenate([model.Q, np.tile(model.Q[:1], (more, 1, 1))])
-    heard = belief.sensors.tolist()
+    heard = {plant.outputs[i].name: column for column, i in enumerate(belief.sensors)}
     for i, name in enumerate(sensors):
         first = len(labels) + kinds * i
         wide[first, offset.shape[1] + i, 0], M0[first, 0, 0] = 1.0, GAIN[1] ** 2 / 3
-        column = heard.index([s.name for s in plant.outputs].index(name)) if name in _names(plant, heard) else None
-        for j, factor in enumerate(GROWN):
-            if column is not None:
-                R[first + 1 + j, column, column] *= factor**2
+        if name in heard:
+            for j, factor in enumerate(GROWN):
+                R[first + 1 + j, heard[name], heard[name]] *= factor**2
     inputs = model.inputs._replace(entries=np.concatenate([model.inputs.entries, entries]).astype(np.int64))
     model = model.replace(inputs=inputs, Q=Q, H=None, lines=(wide_offset, wide))
     shares = np.bincount(label)
     return Rows(model, label, m0, M0, R, -np.log(shares[label]))
-
-
-def _names(plant: Plant, heard: Sequence[int]) -> list[str]:
-    return [plant.outputs[i].name for i in heard]
 
 
 class Bank(NamedTuple):
