@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from fdi_gym.active_rules import ActiveRules, Choice
-from fdi_gym.acts import Acts, costs
+from fdi_gym.acts import Acts, spent
 from fdi_gym.engine import Added, Record, advance
 from fdi_gym.envs import FDIEnv
 from fdi_gym.faults import FaultScenario
@@ -88,7 +88,7 @@ class ActiveEnv(FDIEnv):
         added = self._acts.tables(self._ahead)
         chunk = advance(flights, self._ahead, inputs=added.inputs, references=added.references)
         if self._flown:
-            self._cost = float(costs(flights, chunk, first).sum()) / self._active.period
+            self._cost = float(spent(flights, chunk, first)[0]) / self._active.period
             if flights.terminated[0] and self.scenario is not None:
                 self._lost = self._active.acting.lost * (self.scenario.steps - int(flights.length[0])) / self._active.period
         if self.render_mode is not None:
@@ -203,7 +203,7 @@ class ActiveVectorEnv(FDIVectorEnv):
         first, over = flights.k.copy(), self._over.copy()
         super()._fly_all()
         chunk = Chunk(*(array[period : 2 * period] for array in self._buffer))
-        self._spent = np.where(over, 0.0, costs(flights, chunk, first).sum(axis=0) / period)
+        self._spent = np.where(over, 0.0, spent(flights, chunk, first) / period)
         self._cost = self._spent.copy()
         self._lost[:] = 0.0
         for i in np.flatnonzero(flights.terminated & ~over).tolist():

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiDiscrete, Space
 
+from fdi_gym.acting import Acting
 from fdi_gym.acts import accommodated, acting_of, probe_prices
 from fdi_gym.checks import is_finite
 from fdi_gym.plant import Array
@@ -38,12 +39,17 @@ class ActiveRules(Rules):
             raise ValueError(f"the task of an active environment is one of {', '.join(TASKS)}, not {self.task.name!r}")
         if not is_finite(cost_weight) or cost_weight < 0:
             raise ValueError(f"cost_weight is a number from 0 on, not {cost_weight!r}")
-        self.acting = acting_of(self.plant, probing, accommodation)
+        acting_of(self.plant, probing, accommodation)
         self.probing, self.accommodation, self.cost_weight = bool(probing), bool(accommodation), float(cost_weight)
         self.probes = len(self.acting.probes) if probing else 1
         self.price = self.cost_weight * np.array(probe_prices(self.plant) if probing else [0.0])
         self._labels = len(self.plant.labels)
         self._said_space, self.action_space = self.task.space, self._with_probes(self.task.space)
+
+    @property
+    def acting(self) -> Acting:
+        """What the plant declares."""
+        return acting_of(self.plant)
 
     def _with_probes(self, space: Space[Any]) -> Space[Any]:
         if not self.probing:

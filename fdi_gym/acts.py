@@ -68,11 +68,17 @@ class Acts:
     """
 
     def __init__(self, flights: Flights, probing: bool = True, accommodation: bool = True):
-        self.flights, self.acting = flights, acting_of(flights.plant, probing, accommodation)
+        acting_of(flights.plant, probing, accommodation)
+        self.flights = flights
         self.probe, self.phase = np.zeros(len(flights), np.int64), np.zeros(len(flights), np.int64)
         q = np.asarray(flights.plant.q, float)
         self._q = np.tile(q, (len(flights), 1))
         self._added = np.array([np.zeros_like(q) if p.parameters is None else p.parameters for p in self.acting.probes])
+
+    @property
+    def acting(self) -> Acting:
+        """What the plant declares."""
+        return acting_of(self.flights.plant)
 
     def begin(self, slots: Array) -> None:
         """New flights are in these slots: no probe, the plant's own controller."""
@@ -120,6 +126,14 @@ def costs(flights: Flights, chunk: Chunk, k: Array) -> Array:
             rows[: len(found), i], rows[len(found) :, i] = found, reference[-1]
     cost = acting_of(plant).cost(chunk.state, plant.split(chunk.obs)[1], rows)
     return np.where(k + np.arange(m)[:, None] <= flights.length, cost, 0.0)
+
+
+def spent(flights: Flights, chunk: Chunk, k: Array) -> Array:
+    """What a chunk has cost each flight (N,), added up sample by sample: the same bits for one flight as for many."""
+    total = np.zeros(len(flights))
+    for row in costs(flights, chunk, k):
+        total += row
+    return total
 
 
 @functools.lru_cache(maxsize=32)

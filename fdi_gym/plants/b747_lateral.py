@@ -344,6 +344,10 @@ def processes(airframe: str, closed: bool, dual: bool) -> list[FaultProcess]:
     def quiet(rng: np.random.Generator) -> FaultScenario:
         return standard(rng).replace(reference={"command": "zero"})
 
+    def banking(rng: np.random.Generator) -> FaultScenario:
+        flown = standard(rng)
+        return flown.replace(reference={"command": "zero", "bank_levels": flown.reference["bank_levels"]})
+
     def hard_over(rng: np.random.Generator) -> FaultScenario:
         i, onset = int(rng.integers(2)), int(rng.integers(200, 801))
         return flight(rng, [stuck(SURFACES[i], U_MAX[i] * float(rng.choice([-1, 1])), onset, kind="hard-over")])
@@ -361,7 +365,10 @@ def processes(airframe: str, closed: bool, dual: bool) -> list[FaultProcess]:
         FaultProcess(name="hard-over", description="a surface runs to its limit", sample=hard_over),
         FaultProcess(name="float", description="a surface floats at zero", sample=floating),
     ]  # fmt: skip
-    if not closed:
+    if closed:
+        found.append(FaultProcess(name="banking", description="the standard faults while the autopilot follows bank levels",
+                                  sample=banking))  # fmt: skip
+    else:
         found.append(FaultProcess(name="paper", description="the source's: rudder stuck at 2 deg, 200 to 600 s",
                                   sample=lambda rng: paper(), scoring=Scoring(decision="second_half")))  # fmt: skip
     if dual:
@@ -410,26 +417,32 @@ def regulator(Ad: np.ndarray, Bd: np.ndarray, Q: np.ndarray, R: np.ndarray) -> n
 def acting(airframe: str, Ad: np.ndarray, Bd: np.ndarray, gain: np.ndarray) -> Acting:
     """How the loop with this gain is acted on. The flight costs what its regulator minimises, over (5 deg of bank)^2."""
     Q, R = LQR[airframe]
-    alone = np.zeros((2, 2, 4))  # the gain that is left where one surface is stuck, by that surface
-    for i in (0, 1):
-        if gain.any():
-            alone[i, 1 - i] = regulator(Ad, Bd[:, [1 - i]], Q, R[[1 - i]][:, [1 - i]])[0]
-    trims = [Bd[:, i] @ Q @ Bd[:, 1 - i] / (Bd[:, 1 - i] @ Q @ Bd[:, 1 - i]) for i in (0, 1)]
+
+    @functools.lru_cache(maxsize=4096)
+    def designed(aileron: float, rudder: float) -> tuple[np.ndarray, np.ndarray]:
+        """Gain (2, 4) for surfaces of this effectiveness; what the other one deflects per deg of one that is stuck (2,)."""
+        left = np.array([aileron, rudder])
+        K = gain if (left == 1.0).all() or not gain.any() else regulator(Ad, Bd * left, Q, R)
+        trims = np.zeros(2)
+        for i, j in ((0, 1), (1, 0)):  # so that the steady state costs least
+            if left[i] == 0.0 < left[j]:
+                settled = np.linalg.solve(np.eye(4) - Ad + Bd * left @ K, Bd)
+                trims[i] = settled[:, i] @ Q @ settled[:, j] / (settled[:, j] @ Q @ settled[:, j])
+        return K, trims
 
     def flight_cost(x: np.ndarray, u: np.ndarray, r: np.ndarray) -> np.ndarray:
         error = x - np.stack([*[np.zeros_like(r[..., 2])] * 3, r[..., 2]], axis=-1)
         return ((error**2 * np.diag(Q)).sum(axis=-1) + (u**2 * np.diag(R)).sum(axis=-1)) / 25.0
 
     def accommodate(theta: np.ndarray) -> np.ndarray:
-        n, left = len(theta), 1.0 + np.clip(theta[:, :2], -1.0, 0.0)
-        stuck = left < STUCK
-        K, factor = np.tile(gain, (n, 1, 1)), 1.0 / np.maximum(left, STUCK)
-        offset = np.where(stuck, 0.0, 0.0 - theta[:, 2:])
-        for i in (0, 1):
-            K[stuck[:, i]] = alone[i]
-            offset[:, 1 - i] -= np.where(stuck[:, i], trims[i] * theta[:, 2 + i], 0.0)
-        K, offset, factor = K * factor[..., None], offset * factor, np.where(stuck, 0.0, factor)
-        return np.concatenate([K.reshape(n, 8), np.tile(U_MAX, (n, 1)), factor, offset], axis=1)
+        left = 1.0 + np.clip(theta[:, :2], -1.0, 0.0)
+        left = np.where(left < STUCK, 0.0, np.maximum(np.round(left, 2), STUCK))
+        pairs = [designed(*row) for row in left.tolist()]
+        K, trims = (np.stack(parts).reshape(len(left), -1) for parts in zip(*pairs, strict=True))
+        stuck, b = left == 0.0, theta[:, 2:]
+        factor = np.where(stuck, 0.0, 1.0 / np.maximum(left, STUCK))
+        offset = np.where(stuck, 0.0, 0.0 - b - (trims * np.where(stuck, b, 0.0))[:, ::-1]) * factor
+        return np.concatenate([K, np.tile(U_MAX, (len(left), 1)), factor, offset], axis=1)
 
     return Acting(flight_cost=flight_cost, lost=100.0, probes=PROBES, accommodate=accommodate)
 

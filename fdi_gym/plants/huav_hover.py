@@ -567,8 +567,10 @@ def plant(*, kappa: float = 0.3, K_B: float = 0.84) -> Plant:
     accused = np.array([[c in label.modes for c in CHANNELS] for label in labels])
     wrongly = (accused[None] & ~accused[:, None]).sum(axis=2)
 
+    most = 1.25 * np.array(BIAS)[:, 1]  # beyond that an actuator is stuck, and to ask it for more is in vain
+
     def accommodate(b: np.ndarray) -> np.ndarray:
-        return np.concatenate([np.tile(q, (len(b), 1)), b], axis=1)
+        return np.concatenate([np.tile(q, (len(b), 1)), np.clip(b, -most, most)], axis=1)
 
     q = np.concatenate([K.ravel(), u_trim, x_trim, [p[5], np.exp(-DT / TAU_F)]])
     lim = (20.0, 20.0, 20.0, 8.0, 8.0, 8.0, np.pi / 3, np.pi / 3, np.inf, np.inf, np.inf)
