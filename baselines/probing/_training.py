@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv
 import fdi_gym  # noqa: F401 (registers the environments)
 from baselines.learned._reinforcement import actor_tensors
 from baselines.probing.ppo import features, weights_of
-from fdi_gym.diagnosis import Diagnosis, make_diagnoser
+from fdi_gym.diagnosis import make_diagnoser
 from fdi_gym.diagnosis.contract import choose
 from fdi_gym.plant import Array
 
@@ -83,8 +83,7 @@ class BeliefEnv(VecEnv):
         if done.any():
             begun, said = self.on_board.update(self.on_board.init(self.num_envs), obs[:, -1])
             self.seen = choose(done, begun, self.seen)
-            self.said = Diagnosis(*(choose(done, a, b) if a is not None else None
-                                    for a, b in zip(said[:5], self.said[:5], strict=True)))  # fmt: skip
+            self.said = choose(done, said._replace(signals=None), self.said._replace(signals=None))
             self.last = np.where(done, 0, self.last)
             shown = np.where(done[:, None], features(self.plant, obs[:, -1], self.said, self.last), shown).astype(np.float32)
         return shown, reward.astype(np.float32), done, unpacked

@@ -87,7 +87,7 @@ def probing(suite: Suite, diagnoser: str) -> dict[str, Any]:
             "probed": float((flown.probe[:, 1:] > 0).mean()),
             "lost": int(flown.record.terminated.sum()),
         })  # fmt: skip
-    pictured = {key: found[key] for key in ("never", label_of("greedy", PROBERS["greedy"][2]))}
+    pictured = {key: found[key] for key in ("never", label_of("greedy", PROBERS["greedy"][1]))}
     return {
         "suite": suite._asdict(), "diagnoser": diagnoser, "horizon": horizon,
         "prices": dict(zip([p.name for p in plant.acting.probes], probe_prices(plant), strict=True)),  # type: ignore[union-attr]

@@ -61,8 +61,8 @@ ACCOMMODATION = {
 # Agents that probe: name of the prober and its settings; a curve for each, from little to much
 PROBERS: dict[str, list[dict[str, Any]]] = {
     "never": [{}],
-    "periodic": [{"on": 2, "every": 20}, {"on": 6, "every": 20}, {"on": 20, "every": 20}],
-    "at_random": [{"share": 0.1, "hold": 2}, {"share": 0.3, "hold": 6}, {"share": 1.0, "hold": 20}],
-    "greedy": [{"cost_weight": 30.0}, {"cost_weight": 10.0}, {"cost_weight": 3.0}, {"cost_weight": 0.3}],
+    "periodic": [{"on": 2, "every": 20}, {"on": 6, "every": 20}],
+    "at_random": [{"share": 0.1, "hold": 2}, {"share": 0.3, "hold": 6}],
+    "greedy": [{"cost_weight": 10.0}, {"cost_weight": 3.0}, {"cost_weight": 0.3}],
     "ppo": [{}, {"variant": "discount-0"}],
 }
