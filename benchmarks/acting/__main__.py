@@ -40,7 +40,7 @@ def main() -> None:
             parser.error(f"unknown suite {name!r}; there are {', '.join(everything)}")
         print(name, flush=True)
         if name in ACTIVE:
-            measure.kept(DATA / f"{name}.json", lambda s=ACTIVE[name]: measure.probing(s, s.diagnosers[0]))
+            measure.kept(DATA / f"{name}.json", lambda s=ACTIVE[name]: measure.probing(s))
         elif name in ACCOMMODATION:
             measure.kept(DATA / f"{name}.json", lambda s=ACCOMMODATION[name]: measure.accommodation(s))
         else:

@@ -22,7 +22,8 @@ error and effort, per sample; intervals are 95 %. All differences are paired: th
 
 ## Probing
 
-An agent is a diagnoser, unchanged, and a prober that chooses every decision period: `never` (every passive method),
+An agent is a diagnoser, unchanged, and a prober that chooses every decision period: `never` (every passive method; the
+best of those that were tried is what others are compared with),
 `periodic` and `at_random` (the plant's probes in turn, or drawn), `greedy` (expected information gain against the price of a
 probe), `ppo` (learned). A prober's curve runs from little probing to much. The cost is what the flight costs more than the
 same flight without a probe; the delay is the mean time from the onset to the right label, where later than the median
@@ -61,8 +62,8 @@ def probing_table(found: dict[str, Any]) -> str:
          "" if row["false_alarms_per_hour"] is None else f"{row['false_alarms_per_hour']:.1f}"]
         for row in found["rows"]
     ]  # fmt: skip
-    head = ["agent", "accuracy per sample %", "per decision %", "more than never", "delay s", "less than never", "cost",
-            "time probed %", "false alarms/h"]  # fmt: skip
+    head = ["agent", "accuracy per sample %", "per decision %", "more than the best passive", "delay s",
+            "less than the best passive", "cost", "time probed %", "false alarms/h"]  # fmt: skip
     return markdown(head, rows)
 
 
@@ -78,11 +79,11 @@ def verdict(found: dict[str, Any]) -> str:
                  key=lambda r: r["per_sample"][0])  # fmt: skip
     sure = chosen["per_sample_gain"][1] > 0
     sooner = chosen["delay_gain"] is not None and chosen["delay_gain"][2] < 0
+    words = ["more than chance" if certain else "no more than chance" for certain in (sure, sooner)]
     text = (
         f"The best chosen probing is `{chosen['agent']}`: {pm(chosen['per_sample_gain'], 1, True)} points of accuracy per "
-        f"sample more than never probing ({'more than chance' if sure else 'no more than chance'}), "
-        f"{-chosen['delay_gain'][0]:.2f} s sooner ({'more than chance' if sooner else 'no more than chance'}), at a cost of "
-        f"{pm(chosen['cost'])}."
+        f"sample more than the best that never probes, `{found['passive']}` ({words[0]}), "
+        f"{-(chosen['delay_gain'] or [0.0])[0]:.2f} s sooner ({words[1]}), at a cost of {pm(chosen['cost'])}."
     )
     blind = [r for r in rows if r["prober"] in ("periodic", "at_random") and r["cost"][0] <= chosen["cost"][0]]
     if blind:
