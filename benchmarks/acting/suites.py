@@ -66,4 +66,5 @@ PROBERS: dict[str, list[dict[str, Any]]] = {
     "at_random": [{"share": 0.1, "hold": 2}, {"share": 0.3, "hold": 6}],
     "greedy": [{"cost_weight": 10.0}, {"cost_weight": 3.0}, {"cost_weight": 0.3}],
     "ppo": [{}, {"variant": "discount-0"}],
+    "recurrent_ppo": [{}],
 }
