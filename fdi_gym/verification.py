@@ -18,8 +18,9 @@ import joblib
 import msgspec
 import numpy as np
 
+from fdi_gym.clusters import check_jobs
 from fdi_gym.diagnosis import diagnosers
-from fdi_gym.evaluation import check_jobs, diagnose, digests_of, settings_of
+from fdi_gym.evaluation import diagnose, digests_of, settings_of
 from fdi_gym.files import RefusedError, pretty, write_whole
 from fdi_gym.metrics import Outcome
 from fdi_gym.names import unknown

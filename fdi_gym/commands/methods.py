@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from fdi_gym.commands.arguments import Names
+from fdi_gym.commands.arguments import Backend, Cluster, Names
 
 
 def fit(
@@ -15,6 +15,8 @@ def fit(
     diagnosers: Names = ("all",),
     jobs: int = -1,
     output: Path | None = None,
+    backend: Backend = "loky",
+    cluster: Cluster = {},  # noqa: B006 (tyro reads the default)
 ) -> None:
     """Fit what methods know of a plant, for all suites of it that are here: beliefs, and calibrations on healthy flights.
 
@@ -23,7 +25,10 @@ def fit(
         diagnosers: Names; "reference" for those that others are compared with first, "all" for every one that takes any.
         jobs: Worker processes, -1 for one per core.
         output: Folder that gets PLANT.json. Default: `fits` in the package of the methods, whence they are read.
+        backend: Where they run: "loky" is this machine; dask, ray and slurm are clusters that exist.
+        cluster: What the cluster is told, as name and value in turn: address HOST:PORT, or parameters of submitit.
     """
+    from fdi_gym.clusters import on
     from fdi_gym.diagnosis import find_diagnoser, knowledge, named
     from fdi_gym.listing import find_plant
     from fdi_gym.suite import load_suite, suite_names
@@ -35,7 +40,9 @@ def fit(
     suites = [suite for suite in map(load_suite, suite_names()) if suite.plant == plant_id]
     if not entries or not suites:
         raise ValueError(f"nothing to fit: {len(suites)} suites of {plant_id}, {len(entries)} methods that take a belief")
-    for path, found in knowledge.fit_suites(entries, suites, jobs).items():
+    with on(backend, cluster):
+        fits = knowledge.fit_suites(entries, suites, jobs)
+    for path, found in fits.items():
         place = path if output is None else output / path.name
         knowledge.write_fits(place, found)
         print(f"{len(found.beliefs)} beliefs and {len(found.calibrations)} calibrations in {place}")
