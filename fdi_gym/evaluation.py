@@ -27,7 +27,7 @@ from fdi_gym.files import RefusedError, digest, read_json, sweep, write_whole
 from fdi_gym.metrics import Outcome, outcome
 from fdi_gym.names import blamed, file_name
 from fdi_gym.plant import Plant
-from fdi_gym.provenance import provenance, sources
+from fdi_gym.provenance import packages, provenance, sources
 from fdi_gym.row import Evaluated, Made, Row, outcomes_digest
 from fdi_gym.scores import summarise
 from fdi_gym.suite import AnySuite
@@ -282,7 +282,7 @@ def _evaluated(
     outcomes = [episode for block in blocks for episode in block.outcomes]
     row = Row(
         suite=suite.name, suite_sha256=suite.sha256, diagnoser=name, settings=settings_of(suite, plant, name),
-        digests={"outcomes": outcomes_digest(outcomes), **digests},
+        digests={"outcomes": outcomes_digest(outcomes), **digests}, packages=packages(name, plant),
         metrics=summarise(outcomes, len(plant.labels), [s.name for s in plant.estimated], plant.dt),
     )  # fmt: skip
     time = 1e6 * sum(b.seconds for b in blocks) / sum(b.samples for b in blocks)

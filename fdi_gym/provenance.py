@@ -15,12 +15,14 @@ import os
 import sys
 import sysconfig
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import platformdirs
 
+import fdi_gym
 from fdi_gym.diagnosis import diagnosers, find_diagnoser, make_diagnoser
 from fdi_gym.diagnosis.knowledge import knowledge_of
 from fdi_gym.diagnosis.registry import package_of
@@ -69,6 +71,34 @@ def provenance(name: str, plant: Plant, process: str, settings: Mapping[str, Any
     found = {"method": _digest(method), "plant": _digest(declared), "engine": _digest(engine)}
     found |= {kind: digest(what) for kind, what in knowledge_of(entry, plant, process, settings).items()}
     return found | ({"data": _digest({str(p): p for p in data}, by_name=False)} if data else {})
+
+
+def packages(name: str, plant: Plant) -> dict[str, str]:
+    """The packages of a diagnoser, its plant and the engine, as "name version": one per kind.
+
+    Modules that no installed package brings, such as one in the current folder, have none.
+    """
+    source = plant_sources().get(plant.id)
+    modules = {
+        "method": find_diagnoser(name).build.__module__,
+        "plant": source.builder if source else "",
+        "engine": "fdi_gym",
+    }
+    found = {kind: _package(module.partition(":")[0].partition(".")[0]) for kind, module in modules.items()}
+    return {kind: said for kind, said in found.items() if said}
+
+
+@functools.cache
+def _package(module: str) -> str:
+    """The installed package that brings a top-level module; one that is installed in editable mode names it as a plugin."""
+    if module == "fdi_gym":
+        return f"fdi-gym {fdi_gym.__version__}"
+    for group in ("fdi_gym.diagnosers", "fdi_gym.plants", "fdi_gym.suites"):
+        for point in metadata.entry_points(group=group):
+            if point.value.partition(":")[0].partition(".")[0] == module and point.dist is not None:
+                return f"{point.dist.name} {point.dist.version}"
+    names = metadata.packages_distributions().get(module, [])
+    return f"{names[0]} {metadata.version(names[0])}" if names else ""
 
 
 def _use(name: str, plant: Plant, process: str, settings: Mapping[str, Any]) -> None:

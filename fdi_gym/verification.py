@@ -25,6 +25,7 @@ from fdi_gym.files import RefusedError, pretty, write_whole
 from fdi_gym.metrics import Outcome
 from fdi_gym.names import unknown
 from fdi_gym.plant import Plant
+from fdi_gym.provenance import packages
 from fdi_gym.row import Row, read_outcomes, read_row
 from fdi_gym.scores import summarise
 from fdi_gym.suite import AnySuite, load_suite
@@ -86,14 +87,16 @@ def check_settings(row: Row, suite: AnySuite, plant: Plant) -> None:
     _compare(row, row.settings, settings_of(suite, plant, row.diagnoser), "settings")
 
 
-def check_made_by(row: Row, digests: Mapping[str, str]) -> None:
-    """Compare a row with the digests of what would make it here.
+def check_made_by(row: Row, digests: Mapping[str, str], packages: Mapping[str, str]) -> None:
+    """Compare a row with the digests of what would make it here, and the versions of the packages where it says them.
 
     Raises:
         RefusedError: They are others; they are named.
     """
     try:
         _compare(row, {k: v for k, v in row.digests.items() if k != "outcomes"}, dict(digests), "digests")
+        if row.packages is not msgspec.UNSET:
+            _compare(row, row.packages, dict(packages), "packages")
     except RefusedError as error:
         raise RefusedError(f"{error} (renew it, if the code still gives the same outcomes)") from None
 
@@ -162,16 +165,16 @@ def verify(
     outcomes = read_outcomes(path, row, plant)
     check_row(row, outcomes, frozen, plant)
     check_settings(row, frozen, plant)
-    digests = digests_of(frozen, plant, row.diagnoser)
+    digests, brought = digests_of(frozen, plant, row.diagnoser), packages(row.diagnoser, plant)
     if not renew:
-        check_made_by(row, digests)
+        check_made_by(row, digests, brought)
     rng = np.random.default_rng(seed)
     count = min(frozen.episodes, max(1, math.ceil(share * frozen.episodes)))
     episodes = sorted(int(i) for i in rng.choice(frozen.episodes, count, replace=False))
     check_episodes(row, outcomes, frozen, plant, episodes)
-    changed = row.changed(digests)
+    changed = [*row.changed(digests), *(["packages"] if row.packages != brought else [])] if renew else []
     if changed:
-        write_whole(path, pretty(row.made_by(digests)))
+        write_whole(path, pretty(row.made_by(digests, brought)))
     return Verified(episodes, changed)
 
 
