@@ -116,6 +116,20 @@ def check_episodes(row: Row, outcomes: Sequence[Outcome], suite: AnySuite, plant
             raise RefusedError(f"the code no longer gives this row; {error}") from None
 
 
+def check_trusted(row: Row, path: Path, trust: Collection[str]) -> None:
+    """Make sure, before anything is imported, that a row's method is installed, or may be imported.
+
+    Raises:
+        RefusedError: It is neither.
+    """
+    if ":" in row.diagnoser and row.diagnoser not in trust:
+        raise RefusedError(
+            f"{path}: {row.diagnoser} is code outside the package; look at it, then once more with --trust {row.diagnoser}"
+        )
+    if ":" not in row.diagnoser and row.diagnoser not in diagnosers():
+        raise RefusedError(f"{path}: {unknown('diagnoser', row.diagnoser, diagnosers())}")
+
+
 def check_drawing(share: float, seed: int | None) -> None:
     """Check what draws the episodes that are run again.
 
@@ -154,12 +168,7 @@ def verify(
     """
     check_drawing(share, seed)
     row = read_row(path)
-    if ":" in row.diagnoser and row.diagnoser not in trust:
-        raise RefusedError(
-            f"{path}: {row.diagnoser} is code outside the package; look at it, then verify with --trust {row.diagnoser}"
-        )
-    if ":" not in row.diagnoser and row.diagnoser not in diagnosers():
-        raise RefusedError(f"{path}: {unknown('diagnoser', row.diagnoser, diagnosers())}")
+    check_trusted(row, path, trust)
     frozen = load_suite(suite or row.suite)
     plant = frozen.build()
     outcomes = read_outcomes(path, row, plant)
