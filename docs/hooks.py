@@ -1,6 +1,8 @@
 """Pages of the site that are data: made of the package, the rows and the pages beside them when the site is built.
 
 - plants/<id>.md: the data sheet of every plant, its docstring and what it declares
+- suites/<name>.md: the data sheet of every suite
+- origins.md: where every plant and method comes from, and under which licence it is here
 - methods.md: every diagnoser with its settings
 - boards/...: leaderboards/ as it is, with its pictures
 - reference/<module>.md: the public modules, for mkdocstrings
@@ -28,9 +30,10 @@ from fdi_gym import diagnosis
 from fdi_gym.diagnosis.registry import GIVEN
 from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.leaderboard import read_board
+from fdi_gym.design import DECISIONS, truths
 from fdi_gym.plant import Plant
 from fdi_gym.report import report
-from fdi_gym.suite import load_suite, suite_names
+from fdi_gym.suite import Suite, load_suite, suite_names
 from fdi_gym.tables import markdown, plain
 
 BOARDS = ROOT / "leaderboards"
@@ -46,7 +49,9 @@ REFERENCE = {
                    "estimation.gaussian", "estimation.kalman", "estimation.linear", "estimation.labels",
                    "estimation.interval", "estimation.equivalent"),
     "Scores": ("metrics", "declaration", "scores", "intervals", "comparison", "curves"),
-    "Suites and rows": ("suite", "design", "evaluation", "row", "verification", "leaderboard", "tables"),
+    "Suites and rows": ("suite", "design", "evaluation", "row", "verification", "rounds", "leaderboard", "tables"),
+    "Recordings": ("recordings", "recordings.observations", "recordings.mapping", "recordings.suite", "export"),
+    "Clusters": ("clusters",),
     "Pages and pictures": ("report", "pictures", "plots", "palette"),
     "Checks": ("testing",),
 }  # fmt: skip
@@ -56,6 +61,7 @@ def on_config(config: Any) -> Any:
     """The pages that are made get their places."""
     made = {
         "@plants": ["plants/index.md", *({name: f"plants/{name}.md"} for name in plant_sources())],
+        "@suites": ["suites/index.md", *({name: f"suites/{name}.md"} for name in suite_names())],
         "@boards": ["boards/README.md", {"Grid of methods and plants": "boards/grid.md"},
                     {"Learned": "boards/learning/README.md"}, {"Coverage of the intervals": "boards/coverage.md"},
                     *({path.stem: f"boards/{path.name}"} for path in sorted(BOARDS.glob("*-*.md")))],
@@ -69,6 +75,8 @@ def on_config(config: Any) -> Any:
 def on_files(files: Files, config: Any) -> Files:
     """Make them."""
     texts = {f"plants/{name}.md": data_sheet(load_plant(name)) for name in plant_sources()}
+    texts |= {f"suites/{name}.md": suite_sheet(load_suite(name)) for name in suite_names()}
+    texts |= {"suites/index.md": suites(), "origins.md": origins()}
     texts |= {"plants/index.md": plants(), "methods.md": methods(), "reproduction.md": reproduction()}
     texts |= {f"reference/{_slug(title)}.md": reference(title, modules) for title, modules in REFERENCE.items()}
     mirrored = {f"boards/{path.relative_to(BOARDS).as_posix()}": path for path in BOARDS.rglob("*.*")
@@ -184,7 +192,7 @@ def data_sheet(plant: Plant) -> str:
                  [[f"`{name}`", plain(p.description), str(p.scoring.start), str(p.scoring.grace), p.scoring.decision]
                   for name, p in plant.processes.items()]),
         "### Options", options,
-        "### Suites", ", ".join(f"`{name}`" for name in suite_names() if load_suite(name).plant == plant.id) or "none",
+        "### Suites", ", ".join(f"[{name}](../suites/{name}.md)" for name in suite_names() if load_suite(name).plant == plant.id) or "none",
     ]  # fmt: skip
     return "\n\n".join(parts) + "\n"
 
@@ -209,6 +217,96 @@ def plants() -> str:
     words = ("One page for each plant: what is flown, where its numbers come from and where it departs from its source, and "
              "all that it declares, with units.")  # fmt: skip
     return f"# Data sheets\n\n{words}\n\n{markdown(head, rows)}\n"
+
+
+def suite_sheet(suite: Suite) -> str:
+    """A suite's page: what it is, how it was drawn, what is in it, and what it is not for."""
+    plant = suite.build()
+    scenarios = suite.scenarios(plant, range(suite.episodes))
+    said = [truths(plant, suite.process, scenario) for scenario in scenarios]
+    rows = []
+    for i, label in enumerate(plant.labels):
+        count = sum(labels.count(i) for labels in said)
+        rows.append(
+            [f"`{label.name}`", str(count), str(sum(i in labels for labels in said)), "" if count >= DECISIONS else "*"]
+        )
+    few = any(row[-1] for row in rows)
+    steps = [scenario.steps for scenario in scenarios]
+    process, drawn = plant.processes[suite.process], len(suite.seeds) // suite.windows
+    facts = [
+        ["plant", f"[{plant.id}](../plants/{plant.id}.md), `{suite.env}`"],
+        ["options", ", ".join(f"`{k}={v!r}`" for k, v in suite.options.items()) or "the defaults"],
+        ["fault process", f"`{suite.process}`: {plain(process.description)}"],
+        ["mismatch", "what the process prescribes" if suite.mismatch is None else f"level {suite.mismatch:g}"],
+        ["flights", f"{suite.episodes}: {drawn} as drawn" + (f", {suite.episodes - drawn} without their faults"
+                                                                if suite.healthy else "")],
+        ["seeds", f"{min(suite.seeds)} to {max([*suite.seeds, *suite.healthy])}, public; {suite.windows} a flight"],
+        ["length", f"{min(steps) * plant.dt:g} to {max(steps) * plant.dt:g} s at {plant.dt:g} s; {sum(steps)} samples"],
+        ["scored", f"from sample {process.scoring.start}, but for {process.scoring.grace} samples after a change of the label"],
+        ["tuning of its own", ", ".join(f"`{name}`" for name in suite.settings) or "none"],
+        ["version", f"`{suite.sha256}`"], ["scenarios", f"`{suite.scenarios_sha256}`"],
+        ["origin, licence", "simulated by this package, of the declaration of its plant; MIT, as the package. Nobody's data, no "
+                            "persons"],
+    ]  # fmt: skip
+    parts = [
+        f"# {suite.name}", plain(suite.description) + f". [Board](../boards/{suite.name}.md)."
+        if (BOARDS / f"{suite.name}.md").exists() else plain(suite.description) + ".",
+        markdown(["", ""], facts), "## Decisions",
+        "One about each window of a fault that holds a scored sample, one about each healthy flight.",
+        markdown(["label", "decisions", "flights that have one", ""], rows),
+    ]  # fmt: skip
+    if few:
+        parts.append(f"\\* fewer than {DECISIONS}: what is said about this label alone is uncertain, or it is not drawn.")
+    parts += [
+        "## Use it for, and not for",
+        "For comparing diagnosers on the same flights, with intervals. Not for rates of a fleet: labels are drawn about evenly, "
+        "sizes and onsets by the rules of the process. Not for tuning: its seeds are test seeds; validation begins at "
+        "2,000,000, training at 3,000,000.",
+    ]  # fmt: skip
+    return "\n\n".join(parts) + "\n"
+
+
+def suites() -> str:
+    """All suites."""
+    rows = []
+    for name in suite_names():
+        suite = load_suite(name)
+        rows.append([f"[{name}]({name}.md)", plain(suite.description), suite.plant, suite.process, str(suite.episodes)])
+    words = "Frozen files of seeds: the same flights for everybody. A suite is never changed; another one gets another name."
+    return f"# Suites\n\n{words}\n\n{markdown(['suite', 'what it is', 'plant', 'process', 'flights'], rows)}\n"
+
+
+def origins() -> str:
+    """Where everything comes from."""
+    sheets = [
+        [f"[{name}](plants/{name}.md)", plain(_sources_of(importlib.import_module(source.builder.partition(":")[0])))]
+        for name, source in plant_sources().items()
+    ]  # fmt: skip
+    files: dict[str, list[str]] = {}
+    for name, entry in diagnosis.diagnosers().items():
+        files.setdefault(entry.build.__module__, []).append(name)
+    made = [[f"`{module.replace('.', '/')}.py`", ", ".join(f"`{n}`" for n in names),
+             plain(_sources_of(importlib.import_module(module)))] for module, names in files.items()]  # fmt: skip
+    return "\n\n".join([
+        "# Origins and licences",
+        "All code is written for this package and is MIT-licensed. Equations, numbers and algorithms come from the publications named "
+        "here; no code and no data were copied from elsewhere, and no recording comes with the package. Weights in "
+        "`baselines/learned/weights` were trained here, on flights that were flown here, and are MIT-licensed too; their cards "
+        "say how. What a docstring does not name a source for is textbook, or this benchmark's own.",
+        "## Plants", markdown(["plant", "sources"], sheets), "## Methods", markdown(["file", "names", "sources"], made),
+        "## Libraries",
+        "Dependencies keep their own licences: NumPy, SciPy, Numba and joblib BSD, Gymnasium, tyro and platformdirs MIT, msgspec BSD, "
+        "tqdm MPL 2.0 and MIT, cloudpickle BSD; of the extras torch BSD, stable-baselines3 and sb3-contrib MIT, pyarrow, Ray and "
+        "safetensors Apache 2.0, distributed BSD, submitit and Minari MIT, Matplotlib its own (of the kind of Python's).",
+    ]) + "\n"  # fmt: skip
+
+
+def _sources_of(module: Any) -> str:
+    """The part of a module's docstring that names its sources."""
+    paragraphs = [" ".join(part.split()) for part in (inspect.getdoc(module) or "").split("\n\n")]
+    named = [p for p in paragraphs if re.match(r"(Sources?: |\[1\])", p)]
+    cited = [p for p in paragraphs if re.search(r"\b(?:19|20)\d\d\b", p)]
+    return " ".join(named or cited[:2]) or "textbook, or this benchmark's own"
 
 
 def methods() -> str:

@@ -17,6 +17,8 @@ from fdi_gym.evaluation import evaluate
 from fdi_gym.files import RefusedError
 from fdi_gym.suite import Suite, freeze, load_suite
 
+# before Ray is imported: all of its nodes are on the loopback, and it tells nobody that it is used
+os.environ |= {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_USAGE_STATS_ENABLED": "0"}
 METHODS = """
 import os, signal
 from pathlib import Path
@@ -73,7 +75,7 @@ def cluster(backend):
     elif backend == "ray":
         from ray.cluster_utils import Cluster
 
-        node = {"num_cpus": 1, "node_ip_address": "127.0.0.1", "object_store_memory": 80_000_000}
+        node = {"num_cpus": 1, "object_store_memory": 80_000_000}
         nodes = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
         try:
             nodes.add_node(**node)
@@ -96,8 +98,7 @@ def serial(home, tmp_path_factory):
 
 
 @pytest.mark.parametrize("backend", ["dask", "slurm", "ray"])
-def test_a_cluster_gives_the_bytes_of_this_machine(home, serial, tmp_path, backend, monkeypatch):
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+def test_a_cluster_gives_the_bytes_of_this_machine(home, serial, tmp_path, backend):
     suite, _ = home
     with cluster(backend) as told, clusters.on(backend, told, tmp_path):
         assert rows_of(suite, NAMES, tmp_path / "work") == serial
@@ -112,8 +113,7 @@ def test_a_cluster_gives_the_bytes_of_this_machine(home, serial, tmp_path, backe
 @pytest.mark.parametrize(
     "backend", ["loky", *(pytest.param(name, marks=pytest.mark.slow) for name in ("dask", "ray", "slurm"))]
 )
-def test_a_worker_that_is_killed_in_the_middle_changes_nothing(home, tmp_path, backend, monkeypatch):
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+def test_a_worker_that_is_killed_in_the_middle_changes_nothing(home, tmp_path, backend):
     suite, folder = home
     (folder / "killed").touch()
     expected = rows_of(suite, ["far_away:deadly"], tmp_path / "whole")
