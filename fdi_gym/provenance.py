@@ -14,6 +14,7 @@ import importlib.util
 import os
 import sys
 import sysconfig
+import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
@@ -90,7 +91,10 @@ def packages(name: str, plant: Plant) -> dict[str, str]:
 
 @functools.cache
 def _package(module: str) -> str:
-    """The installed package that brings a top-level module; one that is installed in editable mode names it as a plugin."""
+    """The package that brings a top-level module, as "name version"; "" where none does.
+
+    One that is installed in editable mode is known by its plugins, one that is not installed by the project file beside it.
+    """
     if module == "fdi_gym":
         return f"fdi-gym {fdi_gym.__version__}"
     for group in ("fdi_gym.diagnosers", "fdi_gym.plants", "fdi_gym.suites"):
@@ -98,7 +102,17 @@ def _package(module: str) -> str:
             if point.value.partition(":")[0].partition(".")[0] == module and point.dist is not None:
                 return f"{point.dist.name} {point.dist.version}"
     names = metadata.packages_distributions().get(module, [])
-    return f"{names[0]} {metadata.version(names[0])}" if names else ""
+    if names:
+        return f"{names[0]} {metadata.version(names[0])}"
+    file = _file_of(module)
+    if file is None or file.name != "__init__.py":
+        return ""
+    home = file.parents[2] if file.parents[1].name == "src" else file.parents[1]
+    try:
+        project = tomllib.loads((home / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+        return f"{project['name']} {project['version']}"
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
 
 
 def _use(name: str, plant: Plant, process: str, settings: Mapping[str, Any]) -> None:
