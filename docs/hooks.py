@@ -1,6 +1,8 @@
 """Pages of the site that are data: made of the package, the rows and the pages beside them when the site is built.
 
 - plants/<id>.md: the data sheet of every plant, its docstring and what it declares
+- suites/<name>.md: the data sheet of every suite
+- origins.md: where every plant and method comes from, and under which licence it is here
 - methods.md: every diagnoser with its settings
 - boards/...: leaderboards/ as it is, with its pictures
 - reference/<module>.md: the public modules, for mkdocstrings
@@ -9,8 +11,6 @@
 
 from __future__ import annotations
 
-import importlib
-import inspect
 import logging
 import posixpath
 import re
@@ -22,16 +22,14 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
 
-from fdi_gym import diagnosis
-from fdi_gym.diagnosis.registry import GIVEN
+from sheets import data_sheet, methods, origins, plants, suite_sheet, suites
+
 from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.leaderboard import read_board
-from fdi_gym.plant import Plant
 from fdi_gym.report import report
 from fdi_gym.suite import load_suite, suite_names
-from fdi_gym.tables import markdown, plain
 
 BOARDS = ROOT / "leaderboards"
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)")
@@ -46,7 +44,9 @@ REFERENCE = {
                    "estimation.gaussian", "estimation.kalman", "estimation.linear", "estimation.labels",
                    "estimation.interval", "estimation.equivalent"),
     "Scores": ("metrics", "declaration", "scores", "intervals", "comparison", "curves"),
-    "Suites and rows": ("suite", "design", "evaluation", "row", "verification", "leaderboard", "tables"),
+    "Suites and rows": ("suite", "design", "evaluation", "row", "verification", "rounds", "leaderboard", "tables"),
+    "Recordings": ("recordings", "recordings.observations", "recordings.mapping", "recordings.suite", "export"),
+    "Clusters": ("clusters",),
     "Pages and pictures": ("report", "pictures", "plots", "palette"),
     "Checks": ("testing",),
 }  # fmt: skip
@@ -56,6 +56,7 @@ def on_config(config: Any) -> Any:
     """The pages that are made get their places."""
     made = {
         "@plants": ["plants/index.md", *({name: f"plants/{name}.md"} for name in plant_sources())],
+        "@suites": ["suites/index.md", *({name: f"suites/{name}.md"} for name in suite_names())],
         "@boards": ["boards/README.md", {"Grid of methods and plants": "boards/grid.md"},
                     {"Learned": "boards/learning/README.md"}, {"Coverage of the intervals": "boards/coverage.md"},
                     {"Acting": "boards/acting.md"},
@@ -70,6 +71,8 @@ def on_config(config: Any) -> Any:
 def on_files(files: Files, config: Any) -> Files:
     """Make them."""
     texts = {f"plants/{name}.md": data_sheet(load_plant(name)) for name in plant_sources()}
+    texts |= {f"suites/{name}.md": suite_sheet(load_suite(name)) for name in suite_names()}
+    texts |= {"suites/index.md": suites(), "origins.md": origins()}
     texts |= {"plants/index.md": plants(), "methods.md": methods(), "reproduction.md": reproduction()}
     texts |= {f"reference/{_slug(title)}.md": reference(title, modules) for title, modules in REFERENCE.items()}
     mirrored = {f"boards/{path.relative_to(BOARDS).as_posix()}": path for path in BOARDS.rglob("*.*")
@@ -135,101 +138,7 @@ def _front(text: str, reports: list[str]) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------------------
-# Data sheets
-
-
-def _number(value: float) -> str:
-    return "inf" if value == float("inf") else "-inf" if value == -float("inf") else f"{value:g}"
-
-
-def _signals(signals: Any, *, noise: bool = False, nominal: str = "") -> str:
-    head = ["name", "unit", "low", "high", "scale", *([nominal] if nominal else []), *(["noise (1 sigma)"] if noise else [])]
-    rows = [
-        [f"`{s.name}`", s.unit or "-", _number(s.low), _number(s.high), _number(s.scale),
-         *([_number(s.nominal)] if nominal else []), *([_number(s.sigma)] if noise else [])]
-        for s in signals
-    ]  # fmt: skip
-    return markdown(head, rows)
-
-
-def data_sheet(plant: Plant) -> str:
-    """A plant's page: the docstring of its file, which says what it is and where it departs from its source, then all that
-    it declares."""
-    source = plant_sources()[plant.id].builder.partition(":")[0]
-    words = inspect.getdoc(importlib.import_module(source)) or ""
-    title, _, rest = words.partition("\n")
-    options = markdown(["option", "default"], [[f"`{k}`", f"`{v!r}`"] for k, v in plant.options.items()])
-    parts = [
-        f"# {plant.id}", f"**{title}** Environment `{plant.env_id}`; sample time {plant.dt:g} s; "
-        f"{'linear' if plant.linear else 'nonlinear'} dynamics. Source file: `{source.replace('.', '/')}.py`.",
-        _headings(rest), "## Declared", "What follows is made of the declaration itself.",
-        "### Sensors", _signals(plant.outputs, noise=True),
-        "### Commands", _signals(plant.commands, nominal="trim"),
-    ]  # fmt: skip
-    if plant.known:
-        parts += ["### Known beside them", _signals(plant.known)]
-    parts += ["### States", _signals(plant.states, noise=True)]
-    if plant.disturbances:
-        parts += ["### Disturbances", _signals(plant.disturbances)]
-    parts += [
-        "### Fault parameter theta", _signals(plant.theta, nominal="healthy"),
-        "### Estimated in the identification task", _signals(plant.estimated),
-        "### Fault modes",
-        markdown(["mode", "what it does", "small below", "large from", "reach"],
-                 [[f"`{m.name}`", plain(m.description), _number(m.bands[0]), _number(m.bands[1]),
-                   f"{_number(m.reach[0])} to {_number(m.reach[1])}"] for m in plant.modes]),
-        "### Labels", markdown(["label", "name", "modes"], [[str(i), f"`{x.name}`", ", ".join(sorted(x.modes)) or "-"]
-                                                              for i, x in enumerate(plant.labels)]),
-        "### Fault processes",
-        markdown(["process", "what it draws", "scored from sample", "grace [samples]", "decision"],
-                 [[f"`{name}`", plain(p.description), str(p.scoring.start), str(p.scoring.grace), p.scoring.decision]
-                  for name, p in plant.processes.items()]),
-        "### Options", options,
-        "### Suites", ", ".join(f"`{name}`" for name in suite_names() if load_suite(name).plant == plant.id) or "none",
-    ]  # fmt: skip
-    return "\n\n".join(parts) + "\n"
-
-
-def _headings(text: str) -> str:
-    """A docstring's words under a heading; paragraphs about sources and departures from them are called so."""
-    body, _, sources = text.strip().partition("\nSource")
-    sources = f"Source{sources}".removeprefix("Sources: ").removeprefix("Source: ") if sources else ""
-    return f"## What is flown\n\n{body}" + (
-        f"\n\n## Sources, and what is this benchmark's own\n\n{sources}" if sources else ""
-    )
-
-
-def plants() -> str:
-    """All plants."""
-    rows = []
-    for name in plant_sources():
-        plant = load_plant(name)
-        rows.append([f"[{name}]({name}.md)", plain(plant.description), str(len(plant.outputs)), str(len(plant.labels)),
-                     f"{plant.dt:g}"])  # fmt: skip
-    head = ["plant", "what it is", "sensors", "labels", "sample time [s]"]
-    words = ("One page for each plant: what is flown, where its numbers come from and where it departs from its source, and "
-             "all that it declares, with units.")  # fmt: skip
-    return f"# Data sheets\n\n{words}\n\n{markdown(head, rows)}\n"
-
-
-def methods() -> str:
-    """All diagnosers and trainers."""
-    families: dict[str, list[list[str]]] = {}
-    for name, entry in diagnosis.diagnosers().items():
-        module = entry.build.__module__
-        parameters = list(inspect.signature(entry.build).parameters.values())[1:]
-        settings = [f"{p.name}={entry.settings.get(p.name, p.default)!r}" for p in parameters
-                    if p.name not in GIVEN[entry.kind]]  # fmt: skip
-        knows = f" Knows {entry.knows}." if entry.knows else ""
-        words = ", ".join(f"`{setting}`" for setting in settings).replace("|", "\\|")
-        family = module.split(".")[1] if "." in module else module
-        families.setdefault(family, []).append([f"`{name}`", plain(entry.summary) + knows, words or "-"])
-    parts = ["# Methods", "Every diagnoser that comes with the package, by where it lies in `baselines/`. `fdi-gym list "
-             "NAME` says on which plants one runs, and why not on the others."]  # fmt: skip
-    for family, rows in families.items():
-        parts += [f"## {family}", markdown(["name", "what it is", "settings"], rows)]
-    trainers = [[f"`{name}`", plain(entry.summary)] for name, entry in diagnosis.trainers().items()]
-    return "\n\n".join([*parts, "## Trainers", markdown(["name", "what it trains"], trainers)]) + "\n"
+# Pages that lead to others
 
 
 def reproduction() -> str:

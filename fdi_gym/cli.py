@@ -8,7 +8,7 @@ from typing import Any
 
 import tyro
 
-from fdi_gym.commands import methods, packages, pages, recordings, rows, suites
+from fdi_gym.commands import methods, packages, pages, recordings, rounds, rows, suites
 from fdi_gym.names import in_a_line
 
 COMMANDS: dict[str, Any] = {
@@ -16,6 +16,7 @@ COMMANDS: dict[str, Any] = {
     "leaderboard": pages.leaderboard, "report": pages.report, "plot": pages.plot,
     "list": suites.show, "freeze": suites.freeze, "fit": methods.fit, "train": methods.train,
     "diagnose": recordings.diagnose, "collect": recordings.collect, "export": recordings.export,
+    "seal": rounds.seal, "reveal": rounds.reveal,
     "new": packages.new, "check": packages.check,
 }  # fmt: skip
 

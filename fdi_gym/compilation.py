@@ -9,6 +9,7 @@ from typing import Any
 import joblib
 from tqdm import tqdm
 
+from fdi_gym.clusters import results
 from fdi_gym.kernels import load, uncompiled
 
 
@@ -24,9 +25,10 @@ def compile_kernels(modules: Collection[str], jobs: int = -1, progress: bool = T
     missing = sorted(uncompiled(modules), key=lambda kernel: -kernel.py_func.__code__.co_argcount)
     if len(missing) < 2:
         return
-    parallel: Any = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
-    with tqdm(total=len(missing), desc="compiling, once", unit="kernel", disable=not progress, leave=False) as bar:
-        for _ in parallel(joblib.delayed(_compile)(k.py_func.__module__, k.py_func.__name__) for k in missing):
+    calls = (joblib.delayed(_compile)(k.py_func.__module__, k.py_func.__name__) for k in missing)
+    bar: Any = tqdm(total=len(missing), desc="compiling, once", unit="kernel", disable=not progress, leave=False)
+    with bar, joblib.parallel_config("loky"):  # here, also where a cluster flies: its machines find them in the cache
+        for _ in results(calls, len(missing), min(jobs, joblib.cpu_count())):
             bar.update()
 
 

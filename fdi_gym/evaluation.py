@@ -19,6 +19,7 @@ import msgspec
 from tqdm import tqdm
 
 import fdi_gym
+from fdi_gym.clusters import check_jobs, results
 from fdi_gym.compilation import compile_kernels
 from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, make_diagnoser, run
 from fdi_gym.engine import Record
@@ -26,7 +27,7 @@ from fdi_gym.files import RefusedError, digest, read_json, sweep, write_whole
 from fdi_gym.metrics import Outcome, outcome
 from fdi_gym.names import blamed, file_name
 from fdi_gym.plant import Plant
-from fdi_gym.provenance import provenance, sources
+from fdi_gym.provenance import packages, provenance, sources
 from fdi_gym.row import Evaluated, Made, Row, outcomes_digest
 from fdi_gym.scores import summarise
 from fdi_gym.suite import AnySuite
@@ -157,9 +158,11 @@ def _fly(suite: AnySuite, episodes: range, plant_digest: str) -> tuple[Plant, Re
 
 def _run_block(suite: AnySuite, name: str, episodes: range, path: Path, identity: str, plant: str) -> tuple[str, int, float]:
     """Fly one block, show it to one diagnoser and write what came of it: its name, the block's start and the time."""
-    built, record = _fly(suite, episodes, plant)
-    block = diagnose(suite, built, name, episodes, record)
-    write_block(path, block, identity)
+    block = read_block(path, identity)  # made before its worker was lost
+    if block is None:
+        built, record = _fly(suite, episodes, plant)
+        block = diagnose(suite, built, name, episodes, record)
+        write_block(path, block, identity)
     return name, episodes.start, block.seconds / block.samples
 
 
@@ -227,16 +230,6 @@ class _Plan:
             self.failure = error
 
 
-def check_jobs(jobs: int) -> None:
-    """Check a number of worker processes.
-
-    Raises:
-        ValueError: It is out of range.
-    """
-    if jobs != -1 and jobs < 1:
-        raise ValueError(f"jobs is 1 or more, or -1 for one per core, not {jobs}")
-
-
 def evaluate(
     suite: AnySuite,
     names: Sequence[str],
@@ -253,7 +246,7 @@ def evaluate(
         suite: The suite.
         names: Diagnosers that can run on it (see `applicable`).
         work: Folder of the finished blocks; a run that finds some there goes on from them.
-        jobs: Worker processes, -1 for one per core. A joblib backend (Ray, Dask) is used if one is active.
+        jobs: Worker processes, -1 for one per core; on a cluster calls at a time (`fdi_gym.clusters`).
         progress: Show a progress bar.
         command: What to type to get these rows again.
         block: Episodes flown and diagnosed together.
@@ -268,14 +261,13 @@ def evaluate(
         raise ValueError(f"a block has 1 episode or more, not {block}")
     plant = suite.build()
     suite.check_scenarios(plant)
-    plan = _Plan(suite, plant, list(dict.fromkeys(names)), work, block)
+    plan = _Plan(suite, plant, list(dict.fromkeys(names)), work.resolve(), block)
     plan.folder.mkdir(parents=True, exist_ok=True)
     sweep(plan.folder)
     compile_kernels(sources({__name__, *(find_diagnoser(name).build.__module__ for name in plan.names)}), jobs, progress)
     total = len(plan.names) * len(plan.ranges)
-    parallel: Any = joblib.Parallel(n_jobs=min(jobs, total), return_as="generator_unordered")
     with tqdm(total=total, desc=suite.name, unit="block", disable=not progress) as bar:
-        for name, first, seconds in parallel(plan.tasks(bar)):
+        for name, first, seconds in results(plan.tasks(bar), total, jobs):
             plan.seconds[name] = seconds
             bar.set_postfix_str(f"{name}: from episode {first}")
             bar.update()
@@ -290,7 +282,7 @@ def _evaluated(
     outcomes = [episode for block in blocks for episode in block.outcomes]
     row = Row(
         suite=suite.name, suite_sha256=suite.sha256, diagnoser=name, settings=settings_of(suite, plant, name),
-        digests={"outcomes": outcomes_digest(outcomes), **digests},
+        digests={"outcomes": outcomes_digest(outcomes), **digests}, packages=packages(name, plant),
         metrics=summarise(outcomes, len(plant.labels), [s.name for s in plant.estimated], plant.dt),
     )  # fmt: skip
     time = 1e6 * sum(b.seconds for b in blocks) / sum(b.samples for b in blocks)

@@ -26,6 +26,7 @@ import numpy as np
 from tqdm import tqdm
 
 import fdi_gym
+from fdi_gym.clusters import check_jobs, results
 from fdi_gym.diagnosis.knowledge import code_digest
 from fdi_gym.engine import Record
 from fdi_gym.files import RefusedError, digest, pretty, read_json, sweep, write_whole
@@ -77,6 +78,8 @@ def _write_part(suite: AnySuite, plant: Plant, episodes: range, path: Path) -> N
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    if _is_done(suite, plant, episodes, path):  # before its worker was lost
+        return
     columns, units = _columns(plant, suite.record(plant, episodes), episodes), units_of(plant)
     arrays = {name: pa.array(values) for name, values in columns.items()}
     arrays["label"] = arrays["label"].dictionary_encode()
@@ -115,7 +118,8 @@ def parquet(suite: AnySuite, output: Path, jobs: int = -1, progress: bool = True
         OSError: A part cannot be written; those that are finished stay.
     """
     need("pyarrow", "Parquet")
-    plant, folder = _plant(suite), output / suite.name
+    check_jobs(jobs)
+    plant, folder = _plant(suite), output.resolve() / suite.name
     folder.mkdir(parents=True, exist_ok=True)
     sweep(folder)
     wanted = {folder / f"part-{i:05d}.parquet": episodes for i, episodes in enumerate(blocks(suite, plant))}
@@ -124,18 +128,11 @@ def parquet(suite: AnySuite, output: Path, jobs: int = -1, progress: bool = True
             raise RefusedError(f"{path} is of another export; remove {folder}, or choose another folder")
     todo = {path: episodes for path, episodes in wanted.items() if not _is_done(suite, plant, episodes, path)}
     calls = (joblib.delayed(_write_part)(suite, plant, episodes, path) for path, episodes in todo.items())
-    parallel: Any = joblib.Parallel(n_jobs=_workers(jobs, len(todo)), return_as="generator_unordered")
     with tqdm(total=len(wanted), initial=len(wanted) - len(todo), desc=suite.name, unit="part", disable=not progress) as bar:
-        for _ in parallel(calls):
+        for _ in results(calls, len(todo), jobs):
             bar.update()
     write_whole(output / f"{suite.name}.croissant.json", pretty(croissant(suite, plant, list(wanted))))
     return folder
-
-
-def _workers(jobs: int, tasks: int) -> int:
-    if jobs != -1 and jobs < 1:
-        raise ValueError(f"jobs is 1 or more, or -1 for one per core, not {jobs}")
-    return min(jobs, max(tasks, 1))
 
 
 def _plant(suite: AnySuite) -> Plant:

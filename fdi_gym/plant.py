@@ -201,6 +201,14 @@ class Plant(Truth):
         n_y, n_u = len(self.outputs), len(self.commands)
         return obs[..., :n_y], obs[..., n_y : n_y + n_u], obs[..., n_y + n_u :]
 
+    def scale(self, obs: Array) -> Array:
+        """Observations (..., n_obs) as `units="scaled"` shows them: how many scales of the data sheet off nominal."""
+        return (obs - np.array([s.nominal for s in self.observed])) / np.array([s.scale for s in self.observed])
+
+    def unscale(self, obs: Array) -> Array:
+        """The inverse of `scale`: scaled observations (..., n_obs) in the units of the data sheet."""
+        return obs * np.array([s.scale for s in self.observed]) + np.array([s.nominal for s in self.observed])
+
     def estimate_target(self, theta: Array, u: Array) -> Array:
         """What the identification task asks for, from theta (..., n_theta) and the command held with it (..., n_u)."""
         return theta if self.target is None else self.target(theta, u)

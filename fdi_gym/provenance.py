@@ -14,13 +14,16 @@ import importlib.util
 import os
 import sys
 import sysconfig
+import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import platformdirs
 
+import fdi_gym
 from fdi_gym.diagnosis import diagnosers, find_diagnoser, make_diagnoser
 from fdi_gym.diagnosis.knowledge import knowledge_of
 from fdi_gym.diagnosis.registry import package_of
@@ -69,6 +72,47 @@ def provenance(name: str, plant: Plant, process: str, settings: Mapping[str, Any
     found = {"method": _digest(method), "plant": _digest(declared), "engine": _digest(engine)}
     found |= {kind: digest(what) for kind, what in knowledge_of(entry, plant, process, settings).items()}
     return found | ({"data": _digest({str(p): p for p in data}, by_name=False)} if data else {})
+
+
+def packages(name: str, plant: Plant) -> dict[str, str]:
+    """The packages of a diagnoser, its plant and the engine, as "name version": one per kind.
+
+    Modules that no installed package brings, such as one in the current folder, have none.
+    """
+    source = plant_sources().get(plant.id)
+    modules = {
+        "method": find_diagnoser(name).build.__module__,
+        "plant": source.builder if source else "",
+        "engine": "fdi_gym",
+    }
+    found = {kind: _package(module.partition(":")[0].partition(".")[0]) for kind, module in modules.items()}
+    return {kind: said for kind, said in found.items() if said}
+
+
+@functools.cache
+def _package(module: str) -> str:
+    """The package that brings a top-level module, as "name version"; "" where none does.
+
+    One that is installed in editable mode is known by its plugins, one that is not installed by the project file beside it.
+    """
+    if module == "fdi_gym":
+        return f"fdi-gym {fdi_gym.__version__}"
+    for group in ("fdi_gym.diagnosers", "fdi_gym.plants", "fdi_gym.suites"):
+        for point in metadata.entry_points(group=group):
+            if point.value.partition(":")[0].partition(".")[0] == module and point.dist is not None:
+                return f"{point.dist.name} {point.dist.version}"
+    names = metadata.packages_distributions().get(module, [])
+    if names:
+        return f"{names[0]} {metadata.version(names[0])}"
+    file = _file_of(module)
+    if file is None or file.name != "__init__.py":
+        return ""
+    home = file.parents[2] if file.parents[1].name == "src" else file.parents[1]
+    try:
+        project = tomllib.loads((home / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+        return f"{project['name']} {project['version']}"
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
 
 
 def _use(name: str, plant: Plant, process: str, settings: Mapping[str, Any]) -> None:

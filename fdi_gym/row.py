@@ -47,6 +47,8 @@ class Row(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         diagnoser: Its name, or "module:function".
         settings: What its builder got, in full: the plant's tuning, the process it is told, the suite's settings.
         digests: SHA-256 of the outcomes and of what made them (`fdi_gym.provenance`).
+        packages: Which package, of which version, the method, the plant and the engine are of; not of those that no package
+            brings. Rows that were made before this was noted say nothing.
         metrics: The scores; they follow from the outcomes.
         sha256: Digest of all the rest.
 
@@ -60,6 +62,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     diagnoser: str
     settings: dict[str, Any]
     digests: dict[str, str]
+    packages: dict[str, str] | msgspec.UnsetType = msgspec.UNSET
     metrics: dict[str, Any]
     sha256: str = ""
 
@@ -69,7 +72,8 @@ class Row(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     def content_sha256(self) -> str:
         """The digest that `sha256` must equal."""
-        return digest({k: v for k, v in msgspec.structs.asdict(self).items() if k != "sha256"})
+        said = {k: v for k, v in msgspec.structs.asdict(self).items() if v is not msgspec.UNSET}
+        return digest({k: v for k, v in said.items() if k != "sha256"})
 
     def sealed(self) -> Row:
         """The row as a reader will see it, with its digest."""
@@ -81,9 +85,10 @@ class Row(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         mine = {k: v for k, v in self.digests.items() if k != "outcomes"}
         return sorted(k for k in {*mine, *digests} if mine.get(k) != digests.get(k))
 
-    def made_by(self, digests: Mapping[str, str]) -> Row:
-        """The same row with these digests of what made it."""
-        return msgspec.structs.replace(self, digests={"outcomes": self.digests["outcomes"], **digests}).sealed()
+    def made_by(self, digests: Mapping[str, str], packages: Mapping[str, str]) -> Row:
+        """The same row with these digests of what made it, and these packages."""
+        digests = {"outcomes": self.digests["outcomes"], **digests}
+        return msgspec.structs.replace(self, digests=digests, packages=dict(packages)).sealed()
 
 
 class Made(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

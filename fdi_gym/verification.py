@@ -18,12 +18,14 @@ import joblib
 import msgspec
 import numpy as np
 
+from fdi_gym.clusters import check_jobs
 from fdi_gym.diagnosis import diagnosers
-from fdi_gym.evaluation import check_jobs, diagnose, digests_of, settings_of
+from fdi_gym.evaluation import diagnose, digests_of, settings_of
 from fdi_gym.files import RefusedError, pretty, write_whole
 from fdi_gym.metrics import Outcome
 from fdi_gym.names import unknown
 from fdi_gym.plant import Plant
+from fdi_gym.provenance import packages
 from fdi_gym.row import Row, read_outcomes, read_row
 from fdi_gym.scores import summarise
 from fdi_gym.suite import AnySuite, load_suite
@@ -85,14 +87,16 @@ def check_settings(row: Row, suite: AnySuite, plant: Plant) -> None:
     _compare(row, row.settings, settings_of(suite, plant, row.diagnoser), "settings")
 
 
-def check_made_by(row: Row, digests: Mapping[str, str]) -> None:
-    """Compare a row with the digests of what would make it here.
+def check_made_by(row: Row, digests: Mapping[str, str], packages: Mapping[str, str]) -> None:
+    """Compare a row with the digests of what would make it here, and the versions of the packages where it says them.
 
     Raises:
         RefusedError: They are others; they are named.
     """
     try:
         _compare(row, {k: v for k, v in row.digests.items() if k != "outcomes"}, dict(digests), "digests")
+        if row.packages is not msgspec.UNSET:
+            _compare(row, row.packages, dict(packages), "packages")
     except RefusedError as error:
         raise RefusedError(f"{error} (renew it, if the code still gives the same outcomes)") from None
 
@@ -110,6 +114,20 @@ def check_episodes(row: Row, outcomes: Sequence[Outcome], suite: AnySuite, plant
             _compare(row, said, again, f"outcomes[{i}]", tolerance=1e-6)
         except RefusedError as error:
             raise RefusedError(f"the code no longer gives this row; {error}") from None
+
+
+def check_trusted(row: Row, path: Path, trust: Collection[str]) -> None:
+    """Make sure, before anything is imported, that a row's method is installed, or may be imported.
+
+    Raises:
+        RefusedError: It is neither.
+    """
+    if ":" in row.diagnoser and row.diagnoser not in trust:
+        raise RefusedError(
+            f"{path}: {row.diagnoser} is code outside the package; look at it, then once more with --trust {row.diagnoser}"
+        )
+    if ":" not in row.diagnoser and row.diagnoser not in diagnosers():
+        raise RefusedError(f"{path}: {unknown('diagnoser', row.diagnoser, diagnosers())}")
 
 
 def check_drawing(share: float, seed: int | None) -> None:
@@ -150,27 +168,22 @@ def verify(
     """
     check_drawing(share, seed)
     row = read_row(path)
-    if ":" in row.diagnoser and row.diagnoser not in trust:
-        raise RefusedError(
-            f"{path}: {row.diagnoser} is code outside the package; look at it, then verify with --trust {row.diagnoser}"
-        )
-    if ":" not in row.diagnoser and row.diagnoser not in diagnosers():
-        raise RefusedError(f"{path}: {unknown('diagnoser', row.diagnoser, diagnosers())}")
+    check_trusted(row, path, trust)
     frozen = load_suite(suite or row.suite)
     plant = frozen.build()
     outcomes = read_outcomes(path, row, plant)
     check_row(row, outcomes, frozen, plant)
     check_settings(row, frozen, plant)
-    digests = digests_of(frozen, plant, row.diagnoser)
+    digests, brought = digests_of(frozen, plant, row.diagnoser), packages(row.diagnoser, plant)
     if not renew:
-        check_made_by(row, digests)
+        check_made_by(row, digests, brought)
     rng = np.random.default_rng(seed)
     count = min(frozen.episodes, max(1, math.ceil(share * frozen.episodes)))
     episodes = sorted(int(i) for i in rng.choice(frozen.episodes, count, replace=False))
     check_episodes(row, outcomes, frozen, plant, episodes)
-    changed = row.changed(digests)
+    changed = [*row.changed(digests), *(["packages"] if row.packages != brought else [])] if renew else []
     if changed:
-        write_whole(path, pretty(row.made_by(digests)))
+        write_whole(path, pretty(row.made_by(digests, brought)))
     return Verified(episodes, changed)
 
 

@@ -1,13 +1,17 @@
 """Packages of one's own: what `fdi-gym new` writes conforms, is found by entry points, and its row is verified."""
 
+import json
 import os
+import re
 import subprocess
 import sys
 import tomllib
 
 import pytest
+from conftest import ROOT
 from test_cli import refused
 
+import fdi_gym
 from fdi_gym import discovery, scaffold
 
 
@@ -136,6 +140,21 @@ def test_an_entry_point_that_is_no_plant_harms_nothing(monkeypatch):
             discovery.load_plant("Y")
     finally:
         discovery._entry_point_sources.cache_clear()
+
+
+def test_the_row_of_a_package_says_its_version(made):
+    place, _ = made
+    for name, method, kind in (("bath_tub", "augmented_ekf", "plant"), ("bath_filter", "bath_filter", "method")):
+        said = json.loads((place / name / "results" / f"{name.replace('_', '-')}-bench" / f"{method}.json").read_text())
+        assert said["packages"][kind] == f"{name.replace('_', '-')} 0.1.0"
+        assert said["packages"]["engine"] == f"fdi-gym {fdi_gym.__version__}"
+
+
+def test_the_citation_and_the_project_file_are_of_this_version():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    cited = dict(re.findall(r"^(\w+): (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE))
+    assert cited["version"] == project["version"] == fdi_gym.__version__
+    assert cited["license"] == project["license"] == "MIT"
 
 
 @pytest.mark.slow

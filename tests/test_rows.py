@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 
+import fdi_gym
 from fdi_gym import cli, discovery, evaluation, leaderboard, row, suite, tables, verification
 from fdi_gym.diagnosis import diagnosers, registry
 from fdi_gym.estimation import data
@@ -289,12 +290,33 @@ def test_renewing_writes_the_digests_of_what_is_here_and_nothing_else(rows):
     assert path.stat().st_mtime_ns == before
 
 
+def test_a_row_says_the_packages_that_made_it(rows):
+    """Another version is refused; a row that was made before rows said so holds, and is told when it is renewed."""
+    path, here = row_path(rows, "small", FILTER), f"fdi-gym {fdi_gym.__version__}"
+    honest = path.read_bytes()
+    assert read_row(path).packages == {"method": here, "plant": here, "engine": here}
+    change(path, ("packages", "method"), "fdi-gym 0.0.1")
+    with pytest.raises(RefusedError, match=r"packages\.method: .*0\.0\.1.*renew it"):
+        verify(path)
+    assert verify(path, renew=True).renewed == ["packages"]
+    assert path.read_bytes() == honest
+    content = json.loads(honest)
+    del content["packages"]
+    path.write_bytes(pretty(resealed(content)))
+    assert read_row(path).packages is msgspec.UNSET
+    old = path.read_bytes()
+    assert verify(path).renewed == []
+    assert path.read_bytes() == old
+    assert verify(path, renew=True).renewed == ["packages"]
+    assert path.read_bytes() == honest
+
+
 def test_a_forged_row_is_never_renewed(rows):
     """Whatever else is changed in a row of other sources, it is refused and stays as it is."""
     path = row_path(rows, "small", FILTER)
     change(path, ("digests", "engine"), "f" * 64)
     old = path.read_bytes()
-    places = [(keys, value) for keys, value in leaves(json.loads(old)) if keys[0] not in ("sha256", "digests")]
+    places = [(keys, value) for keys, value in leaves(json.loads(old)) if keys[0] not in ("sha256", "digests", "packages")]
     named = [i for i, (keys, _) in enumerate(places) if keys[0] != "metrics"]
     assert len(named) >= 5
     for i in {*np.random.default_rng(1).choice(len(places), 25, replace=False).tolist(), *named}:

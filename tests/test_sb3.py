@@ -5,12 +5,17 @@ import pickle
 import gymnasium as gym
 import numpy as np
 import pytest
+from conftest import build
 from gymnasium.vector import AutoresetMode
 from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecMonitor, VecNormalize
 
+from baselines.learned.adapters import from_recurrent, from_sb3
+from fdi_gym.diagnosis import run
+from fdi_gym.engine import simulate
 from fdi_gym.envs import FDIEnv
+from fdi_gym.faults import draw
 from fdi_gym.sb3 import FDIVecEnv, make_vec_env
 from fdi_gym.wrappers import DelayAwareReward, VectorHistory
 
@@ -95,6 +100,86 @@ def test_sb3_trains_normalises_and_evaluates():
     plain.seed(3)
     scores = [evaluate_policy(model, VecMonitor(v), n_eval_episodes=16, warn=False) for v in (again, plain)]
     assert scores[0] == pytest.approx(scores[1])
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Diagnosers with a memory
+
+
+def flown(seeds=range(3_000_000, 3_000_004), samples=241):
+    plant = build("B747Lateral")
+    return plant, simulate(plant, [draw(plant.process("standard"), seed) for seed in seeds]).obs[:, :samples]
+
+
+def test_scaled_units_are_the_plants_scale(plant):
+    env = gym.make(plant.env_id, units="scaled").unwrapped
+    seen, _ = env.reset(seed=5)
+    raw, _ = gym.make(plant.env_id).reset(seed=5)
+    assert np.array_equal(seen, plant.scale(raw).astype(np.float32))
+    assert np.allclose(plant.unscale(plant.scale(raw)), raw, rtol=1e-12)
+    assert np.array_equal(plant.unscale(np.zeros(len(raw))), [s.nominal for s in plant.observed])
+
+
+@pytest.mark.parametrize("task", ["isolation", "identification"])
+def test_a_recurrent_policy_says_what_it_says_in_its_environment(task):
+    contrib = pytest.importorskip("sb3_contrib")
+    plant, obs = flown()
+    venv = make_vec_env("B747Lateral-Faults-v0", 4, units="scaled", decision_period=20, task=task, seed=3_000_000)
+    model = contrib.RecurrentPPO("MlpLstmPolicy", venv, n_steps=8, batch_size=16, n_epochs=1, seed=0, device="cpu",
+                                 policy_kwargs={"lstm_hidden_size": 16, "n_lstm_layers": 2})  # fmt: skip
+    model.learn(64)
+    said = run(from_sb3(model.policy, plant, task=task, decision_period=20), obs)
+    shown, memory = venv.reset(), None
+    venv.seed(3_000_000)
+    shown = venv.reset()
+    for k in range(12):
+        action, memory = model.predict(shown, memory, np.full(4, k == 0), deterministic=True)
+        at = 20 * k
+        if task == "isolation":
+            assert np.array_equal(action, said.label[:, at])
+        else:
+            low, high = (np.array([getattr(s, name) for s in plant.estimated]) for name in ("low", "high"))
+            assert np.allclose(low + (high - low) * (action + 1) / 2, said.estimate[:, at], atol=1e-5)
+        shown, *_ = venv.step(action)
+    first = run(from_sb3(model.policy, plant, task=task, decision_period=20), obs[:, 200:])
+    answer = "label_probs" if task == "isolation" else "estimate"
+    assert not np.allclose(getattr(first, answer)[:, 0], getattr(said, answer)[:, 200])  # it remembers
+
+
+def test_a_module_with_a_state_streams_what_it_says_of_the_whole_flight():
+    import torch
+
+    class Net(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.gru, self.head = torch.nn.GRU(6, 12), torch.nn.Linear(12, 5)
+
+        def forward(self, obs, state):
+            found, state = self.gru(obs[None], state)
+            return self.head(found[0]), state
+
+    plant, obs = flown(samples=50)
+    torch.manual_seed(0)
+    module = Net()
+    diagnoser = from_recurrent(module, plant, dtype=torch.float64)
+    said = run(diagnoser, obs)
+    with torch.inference_mode():
+        whole = torch.from_numpy(plant.scale(obs).astype(np.float32).astype(float)).swapaxes(0, 1)
+        logits = module.head(module.gru(whole)[0]).swapaxes(0, 1).numpy()
+    odds = np.exp(logits)
+    assert np.allclose(said.label_probs, odds / odds.sum(axis=2, keepdims=True), rtol=1e-9)
+    assert np.ptp(said.label_probs, axis=1).max() > 1e-3
+    state = diagnoser.init(len(obs))
+    once, twice = (diagnoser.update(diagnoser.update(state, obs[:, 0])[0], obs[:, 1])[1] for _ in range(2))
+    assert np.array_equal(once.label_probs, twice.label_probs)  # a state is a value
+
+
+def test_a_policy_without_a_distribution_is_refused():
+    from stable_baselines3 import DQN
+
+    venv = make_vec_env("B747Lateral-Faults-v0", 1, units="scaled", decision_period=200)
+    with pytest.raises(TypeError, match="actor-critic"):
+        from_sb3(DQN("MlpPolicy", venv, buffer_size=10, device="cpu").policy, build("B747Lateral"))
 
 
 # ---------------------------------------------------------------------------------------------------------------

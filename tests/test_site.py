@@ -5,11 +5,14 @@ import os
 import re
 import subprocess
 import sys
+from collections import Counter
 
 import pytest
 from conftest import PLANTS, ROOT, build
 
+from fdi_gym.design import truths
 from fdi_gym.diagnosis import diagnosers
+from fdi_gym.suite import load_suite, suite_names
 
 pytest.importorskip("mkdocstrings", reason="pip install 'fdi-gym[docs]'")
 pytest.importorskip("material", reason="pip install 'fdi-gym[docs]'")
@@ -53,6 +56,27 @@ def test_a_data_sheet_says_all_that_a_plant_declares(site, plant_id):
     for name in (*plant.processes, *plant.options, plant.env_id):
         assert name in said
     assert "Sources, and what is this benchmark's own" in said
+
+
+@pytest.mark.parametrize("name", suite_names())
+def test_a_suites_sheet_says_what_is_in_it(site, name):
+    suite, said = load_suite(name), words(site / "suites" / f"{name}.html")
+    plant = suite.build()
+    held = Counter(v for s in suite.scenarios(plant, range(suite.episodes)) for v in truths(plant, suite.process, s))
+    for i, label in enumerate(plant.labels):
+        assert f"{label.name} {held[i]} " in said
+    for word in (suite.sha256, suite.scenarios_sha256, f"{suite.episodes}: ", "MIT", plant.env_id):
+        assert word in said
+
+
+def test_every_plant_and_method_says_where_it_comes_from(site):
+    said = words(site / "origins.html")
+    for name in (
+        *PLANTS,
+        *(name for name, entry in diagnosers().items() if entry.build.__module__.startswith("baselines.")),
+    ):
+        assert f"{name} " in said or f"{name}," in said
+    assert "Source: " in said
 
 
 def test_every_method_has_its_line(site):

@@ -8,6 +8,9 @@ In so many samples they can be told apart by the Kullback-Leibler divergence
 which is measured on flights without noise, of faults drawn from the process. An error between i and j, of which one is
 true with the believed probabilities p_i and p_j, is resolved with the probability 1 - exp(-D_ij), and a fault that is
 found pays for so many decisions to come. What that is worth more than without a probe is set against the price.
+
+What is believed is what the diagnoser says, and doubt: at every decision a fault may have begun that has not been seen,
+and what has been probed since is known better, by the same 1 - exp(-D_ij).
 """
 
 from __future__ import annotations
@@ -28,73 +31,94 @@ from fdi_gym.flights import Flights
 from fdi_gym.plant import Array, Plant
 
 SEEDS = range(2_000_000, 2_002_000)  # of the faults that the hypotheses stand for
-EXAMPLES = 4  # of each
+EXAMPLES, BASES = 3, 3  # faults of each label, flights that they are put on
 
 
 def prober(
     plant: Plant, *, process: str = "standard", period: int = 10, pays_for: float = 30.0, cost_weight: float = 1.0,
-    window: int = 200, least: float = 0.02,
+    window: int = 400,
 ) -> Prober:  # fmt: skip
     """The probe with the largest gain, if any has one.
 
     Args:
         plant: The plant.
-        process: The fault process that is met.
+        process: The fault process that is met; how often its faults begin is the hazard.
         period: Decision period [samples].
         pays_for: Decisions for which a fault that is told from another pays.
         cost_weight: Factor on the price of a probe.
         window: Samples over which hypotheses are told apart by a probe that goes on.
-        least: The probability that every label keeps, since what has not been probed has not been seen.
     """
-    gains = 1.0 - np.exp(-divergences(plant, process, window) * period / window)  # (probes, labels, labels)
+    gains = (1.0 - np.exp(-divergences(plant, process, window) * period / window)).mean(axis=0)  # (probes, labels, labels)
     price = cost_weight * np.array(probe_prices(plant))
-    labels = len(plant.labels)
+    labels, hazard = len(plant.labels), _hazard(plant, process, period)
 
-    def choose(state: Any, obs: Array, said: Diagnosis) -> tuple[Any, Array]:
-        probs = np.eye(labels)[np.clip(said.label, 0, labels - 1)] if said.label_probs is None else said.label_probs
-        probs = np.nan_to_num(probs) * (1.0 - least) + least / labels
+    def choose(doubt: Array, obs: Array, said: Diagnosis) -> tuple[Array, Array]:
+        label = np.clip(said.label, 0, labels - 1)
+        probs = np.eye(labels)[label] if said.label_probs is None else np.nan_to_num(said.label_probs)
+        doubt = np.minimum(doubt + hazard, 0.5 / labels)
+        doubt[np.arange(len(label)), label] = 0.0
+        probs = (1.0 - doubt.sum(axis=1, keepdims=True)) * probs + doubt
         resolved = np.einsum("ni,pij,nj->np", probs, gains, probs) / 2.0
-        worth = pays_for * (resolved - resolved[:, :1]) - price
-        return state, worth.argmax(axis=1)
+        probe = (pays_for * (resolved - resolved[:, :1]) - price).argmax(axis=1)
+        return doubt * (1.0 - gains[probe, label]), probe
 
-    return Prober(lambda n: n, choose)
+    return Prober(lambda n: np.zeros((n, labels)), choose)
+
+
+def _hazard(plant: Plant, process: str, period: int) -> float:
+    """The probability that a fault of one label begins within a decision, from flights of the process."""
+    flights = [draw(plant.process(process), seed) for seed in SEEDS[:100]]
+    begun = sum(len(s.faults) for s in flights)
+    return begun * period / sum(s.steps for s in flights) / (len(plant.labels) - 1)
 
 
 def divergences(plant: Plant, process: str, window: int) -> Array:
-    """D (probes, labels, labels) over so many samples after a start at trim; the mean over the examples of two labels."""
-    scenarios, label = _examples(plant, process, window)
+    """D (bases, probes, labels, labels) over so many samples from when the faults begin, as late as they do in the process.
+
+    Bases are flights without a fault, on which faults of each label are put; of two labels the mean over their faults.
+    """
+    faults, label, onset = _examples(plant, process)
     filtered = _steady(plant)
     assert plant.acting is not None
     found = []
-    for number in range(len(plant.acting.probes)):
-        flights = Flights(plant, scenarios, [no_noise(plant, s.steps) for s in scenarios])
-        acts = Acts(flights, accommodation=False)
-        acts.choose(np.full(len(flights), number))
-        added = acts.tables(window)
-        obs = advance(flights, window, inputs=added.inputs, references=added.references).obs
-        nu = _innovations(plant, filtered, obs)  # (window, flights, n_y), whitened
-        D = 0.5 * ((nu[:, :, None] - nu[:, None]) ** 2).sum(axis=(0, 3))
-        apart = np.zeros((len(plant.labels), len(plant.labels)))
-        for i, j in itertools.permutations(np.unique(label), 2):
-            apart[i, j] = np.nan_to_num(D[np.ix_(label == i, label == j)]).mean()
-        found.append(apart)
+    for seed in SEEDS[:BASES]:
+        base = draw(plant.process("fault-free"), seed).replace(physical={})
+        begins = min(onset, base.steps - window - 1)
+        begun = [[msgspec.structs.replace(f, onset=begins, end=None) for f in some] for some in faults]
+        scenarios = [base.replace(faults=some) for some in begun]
+        quiet = [no_noise(plant, base.steps)] * len(scenarios)
+        found.append([])
+        for number in range(len(plant.acting.probes)):
+            flights = Flights(plant, scenarios, quiet)
+            acts = Acts(flights, accommodation=False)
+            advance(flights, begins)
+            acts.choose(np.full(len(flights), number))
+            added = acts.tables(window)
+            chunk = advance(flights, window, inputs=added.inputs, references=added.references)
+            nu = _innovations(plant, filtered, chunk.state[0], chunk.obs, begins)  # (window, flights, n_s), whitened
+            D = 0.5 * ((nu[:, :, None] - nu[:, None]) ** 2).sum(axis=(0, 3))
+            apart = np.zeros((len(plant.labels), len(plant.labels)))
+            for i, j in itertools.permutations(np.unique(label), 2):
+                apart[i, j] = np.nan_to_num(D[np.ix_(label == i, label == j)]).mean()
+            found[-1].append(apart)
     return np.array(found)
 
 
-def _examples(plant: Plant, process: str, window: int) -> tuple[list[Any], Array]:
-    """Flights that begin with their fault: a few of each label that the process draws, and their labels."""
-    kept: dict[int, list[Any]] = {0: []}
-    for seed in SEEDS:
+def _examples(plant: Plant, process: str) -> tuple[list[Any], Array, int]:
+    """Faults of each label that the process draws, a few of each, their labels, and the sample where half have begun."""
+    kept: dict[int, list[Any]] = {0: [[]]}
+    onsets = []
+    for seed in SEEDS[:400]:
         scenario = draw(plant.process(process), seed)
-        faults = [f for f in scenario.faults if f.onset == min(g.onset for g in scenario.faults)]
-        label = plant.label_of(frozenset(f.mode for f in faults))
+        if not scenario.faults:
+            continue
+        onsets.append(min(f.onset for f in scenario.faults))
+        together = [f for f in scenario.faults if f.onset == onsets[-1]]
+        label = plant.label_of(frozenset(f.mode for f in together))
         if len(kept.setdefault(label, [])) < EXAMPLES:
-            begun = [msgspec.structs.replace(f, onset=1, end=None) for f in faults]
-            kept[label].append(scenario.replace(faults=begun, physical={}, x0=None))
-        if len(kept) == len(plant.labels) and all(len(v) == EXAMPLES for v in kept.values()):
-            break
-    label = np.repeat(list(kept), [len(v) for v in kept.values()])
-    return [s for v in kept.values() for s in v], label
+            kept[label].append(together)
+    label = np.repeat(list(kept), [len(some) for some in kept.values()])
+    return [faults for some in kept.values() for faults in some], label, int(np.median(onsets))
 
 
 def _steady(plant: Plant) -> tuple[Array, Array, Array]:
@@ -111,14 +135,14 @@ def _steady(plant: Plant) -> tuple[Array, Array, Array]:
     return np.linalg.solve(S, C @ P).T, seen, np.linalg.inv(np.linalg.cholesky(S))
 
 
-def _innovations(plant: Plant, steady: tuple[Array, Array, Array], obs: Array) -> Array:
-    """The whitened innovations (K, n, n_s) of the healthy plant's filter on observations (K, n, n_obs)."""
+def _innovations(plant: Plant, steady: tuple[Array, Array, Array], x: Array, obs: Array, first: int) -> Array:
+    """The whitened innovations (K, n, n_s) of the healthy plant's filter from the states x (n, n_x) of a sample on."""
     K, seen, whiten = steady
     y, u, _ = plant.split(obs)
-    x, found = np.tile(plant.trim_state, (obs.shape[1], 1)), []
+    found = []
     for k in range(len(obs)):
-        x = plant.propagate((k - 1) * plant.dt, x, u[k]) if k else x
-        nu = (y[k] - plant.measure(k * plant.dt, x, u[k]))[:, seen]
+        x = plant.propagate((first + k - 1) * plant.dt, x, u[k]) if k else x
+        nu = (y[k] - plant.measure((first + k) * plant.dt, x, u[k]))[:, seen]
         found.append(nu @ whiten.T)
         x = x + nu @ K.T
     return np.array(found)

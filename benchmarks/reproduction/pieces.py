@@ -13,6 +13,8 @@ import msgspec
 import tyro
 from tqdm import tqdm
 
+from fdi_gym.clusters import on, results
+from fdi_gym.commands.arguments import Backend, Cluster
 from fdi_gym.files import RefusedError, read_json, write_whole
 
 Jobs = dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]  # name: function and its arguments
@@ -40,9 +42,8 @@ def pieces(folder: Path, jobs: Jobs, workers: int = -1) -> dict[str, Any]:
     done = finished(folder, jobs)
     missing = {name: job for name, job in jobs.items() if name not in done}
     if missing:
-        parallel = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")
-        tasks = (joblib.delayed(_one)(_file(folder, name), *job) for name, job in missing.items())
-        for _ in tqdm(parallel(tasks), total=len(missing), unit="piece"):
+        tasks = (joblib.delayed(_one)(_file(folder.resolve(), name), *job) for name, job in missing.items())
+        for _ in tqdm(results(tasks, len(missing), workers), total=len(missing), unit="piece"):
             pass
         done |= finished(folder, missing)
     return {name: done[name] for name in jobs}
@@ -69,7 +70,11 @@ class Arguments:
     pages: Path = Path("leaderboards/reproduction")
     """Folder of the page and its figures."""
     workers: int = -1
-    """Processes; -1 for one per core."""
+    """Processes, or jobs of a cluster at a time; -1 for one per core."""
+    backend: Backend = "loky"
+    """Where they run: processes of this machine, or a cluster."""
+    cluster: Cluster = dataclasses.field(default_factory=dict)
+    """What the cluster is told, as name and value in turn; see docs/pages/clusters.md."""
 
 
 def command(
@@ -86,7 +91,8 @@ def command(
     arguments = tyro.cli(Arguments, description=f"Reference figures of {plant}, measured again.")
     work = arguments.work / plant / ("quick" if arguments.quick else "full")
     jobs = plan(arguments.quick)
-    found = finished(work, jobs) if arguments.page_only else pieces(work, jobs, arguments.workers)
+    with on(arguments.backend, arguments.cluster, arguments.work):
+        found = finished(work, jobs) if arguments.page_only else pieces(work, jobs, arguments.workers)
     if len(found) < len(jobs) and not partial:
         raise SystemExit(f"{len(jobs) - len(found)} of {len(jobs)} pieces are not finished in {work}: leave out --page-only")
     page = (work if arguments.quick else arguments.pages) / f"{plant}.md"

@@ -11,4 +11,6 @@ WIDTH = 120  # of tables on the screen
 Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="METHOD")]
 SuiteNames = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="SUITE")]
 SuiteName = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SUITE")]
+Backend = Annotated[str, tyro.conf.arg(metavar="loky|dask|ray|slurm")]
+Cluster = Annotated[dict[str, str], tyro.conf.arg(metavar="SETTING VALUE")]
 PlantName = Annotated[str, tyro.conf.arg(metavar="PLANT")]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from fdi_gym.commands.arguments import Names
+from fdi_gym.commands.arguments import Backend, Cluster, Names
 
 
 def fit(
@@ -18,6 +18,8 @@ def fit(
     renew: bool = False,
     count: int = 4,
     seed: int | None = None,
+    backend: Backend = "loky",
+    cluster: Cluster = {},  # noqa: B006 (tyro reads the default)
 ) -> None:
     """Fit what methods know of a plant, for all suites of it that are here: beliefs, and calibrations on healthy flights.
 
@@ -30,9 +32,12 @@ def fit(
             the same bytes write the present digest of the code into the file.
         count: So many beliefs and calibrations are found anew then.
         seed: Which ones. Default: drawn anew each time.
+        backend: Where they run: "loky" is this machine; dask, ray and slurm are clusters that exist.
+        cluster: What the cluster is told, as name and value in turn: address HOST:PORT, or parameters of submitit.
     """
     import secrets
 
+    from fdi_gym.clusters import on
     from fdi_gym.diagnosis import find_diagnoser, knowledge, named
     from fdi_gym.diagnosis.registry import package_of
     from fdi_gym.listing import find_plant
@@ -51,7 +56,9 @@ def fit(
             knowledge.write_fits(path, knowledge.renewed(path, entries, suites, count, seed))
             print(f"{count} beliefs and {count} calibrations (seed {seed}) are the same bytes; {path} is of this code now")
         return
-    for path, found in knowledge.fit_suites(entries, suites, jobs).items():
+    with on(backend, cluster):
+        fits = knowledge.fit_suites(entries, suites, jobs)
+    for path, found in fits.items():
         place = path if output is None else output / path.name
         knowledge.write_fits(place, found)
         print(f"{len(found.beliefs)} beliefs and {len(found.calibrations)} calibrations in {place}")

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from fdi_gym.commands.arguments import Names, PlantName, SuiteName
+from fdi_gym.commands.arguments import Backend, Cluster, Names, PlantName, SuiteName
 
 
 def diagnose(
@@ -184,6 +184,8 @@ def export(
     format: Literal["parquet", "minari"] = "parquet",
     output: Path = Path("export"),
     jobs: int = -1,
+    backend: Backend = "loky",
+    cluster: Cluster = {},  # noqa: B006 (tyro reads the default)
 ) -> None:
     """Write a suite's flights as files for others, truth included; an export that was killed goes on.
 
@@ -192,13 +194,17 @@ def export(
         format: Parquet files with a Croissant description, or a data set of Minari.
         output: Folder of exports; for Minari, what MINARI_DATASETS_PATH is set to.
         jobs: Worker processes for Parquet, -1 for one per core.
+        backend: Where they run: "loky" is this machine; dask, ray and slurm are clusters that exist.
+        cluster: What the cluster is told, as name and value in turn: address HOST:PORT, or parameters of submitit.
     """
     from fdi_gym import export as to
+    from fdi_gym.clusters import on
     from fdi_gym.suite import load_suite
 
     frozen = load_suite(suite)
     if format == "parquet":
-        print(to.parquet(frozen, output, jobs))
+        with on(backend, cluster, output):
+            print(to.parquet(frozen, output, jobs))
     else:
         folder = to.minari(frozen, output)
         print(f'{folder}: MINARI_DATASETS_PATH={output}, minari.load_dataset("{folder.relative_to(output).as_posix()}")')

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import tyro
 
-from fdi_gym.commands.arguments import WIDTH, Names, SuiteNames
+from fdi_gym.commands.arguments import WIDTH, Backend, Cluster, Names, SuiteNames
 
 if TYPE_CHECKING:
     from fdi_gym.plant import Plant
@@ -38,6 +38,8 @@ def evaluate(
     csv: Path | None = None,
     episodes: int | None = None,
     replace: bool = False,
+    backend: Backend = "loky",
+    cluster: Cluster = {},  # noqa: B006 (tyro reads the default)
 ) -> None:
     """Run diagnosers on suites, print the comparison table of each, and write one row per diagnoser and suite.
 
@@ -53,8 +55,11 @@ def evaluate(
         csv: A file for all figures, comma-separated.
         episodes: A quick look: so many of the flights of each suite, evenly spread. Makes no rows.
         replace: Rows in the folder that other sources, settings or data have made may go.
+        backend: Where they run: "loky" is this machine; dask, ray and slurm are clusters that exist.
+        cluster: What the cluster is told, as name and value in turn: address HOST:PORT, or parameters of submitit.
     """
     from fdi_gym import evaluation, leaderboard, row, tables
+    from fdi_gym.clusters import on
     from fdi_gym.files import write_whole
     from fdi_gym.names import unknown
 
@@ -71,7 +76,8 @@ def evaluate(
     for said, suite, plant, names in asked:
         begun = time.monotonic()
         command = f"fdi-gym evaluate {said} --diagnosers {' '.join(names)}"
-        found = evaluation.evaluate(suite, names, work=work, jobs=jobs, command=command)
+        with on(backend, cluster, work):
+            found = evaluation.evaluate(suite, names, work=work, jobs=jobs, command=command)
         rows = [f.row for f in found.values()]
         mine = {name: f.made.microseconds for name, f in found.items()}
         board = leaderboard.Board(suite, plant, rows, {name: f.outcomes for name, f in found.items()}, mine)

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from fdi_gym.clusters import in_order
 from fdi_gym.diagnosis import fitting
 from fdi_gym.diagnosis.fitting import fit_belief, fit_calibration
 from fdi_gym.diagnosis.registry import Entry, find_diagnoser, package_of
@@ -189,15 +190,13 @@ def fit_suites(entries: Sequence[Entry], suites: Sequence[Any], jobs: int = -1) 
 
     tasks = tasks_of(entries, suites)
     wanted = {belief_key(t.plant, t.process): t for t in tasks.values() if t.entry.takes("belief")}
-    made = joblib.Parallel(jobs)(joblib.delayed(_belief)(t.plant, t.process) for t in wanted.values())
+    made = in_order([joblib.delayed(_belief)(t.plant, t.process) for t in wanted.values()], jobs)
     beliefs: dict[str, Belief | None] = dict(zip(wanted, made, strict=True))
     calls = [
         joblib.delayed(_calibration)(t.entry.name, *t[1:], beliefs.get(belief_key(t.plant, t.process)))
         for t in tasks.values() if t.entry.takes("calibration")
     ]  # fmt: skip
-    found = dict(
-        zip([k for k, t in tasks.items() if t.entry.takes("calibration")], joblib.Parallel(jobs)(calls), strict=True)
-    )
+    found = dict(zip([k for k, t in tasks.items() if t.entry.takes("calibration")], in_order(calls, jobs), strict=True))
     files: dict[Path, Fits] = {}
     for key, task in tasks.items():
         home = package_of(task.entry)

@@ -186,7 +186,7 @@ def read_recorded(path: Path) -> RecordedSuite:
         raise RefusedError(
             f"{path} was edited after it was made: its hash is {suite.content_sha256()[:12]}, it says {suite.sha256[:12]}"
         )
-    return msgspec.structs.replace(suite, folder=str(path.parent))
+    return msgspec.structs.replace(suite, folder=str(path.resolve().parent))
 
 
 def collect(
