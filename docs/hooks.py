@@ -59,7 +59,8 @@ def on_config(config: Any) -> Any:
         "@boards": ["boards/README.md", {"Grid of methods and plants": "boards/grid.md"},
                     {"Learned": "boards/learning/README.md"}, {"Coverage of the intervals": "boards/coverage.md"},
                     *({path.stem: f"boards/{path.name}"} for path in sorted(BOARDS.glob("*-*.md")))],
-        "@reproduction": ["reproduction.md", *({path.stem: f"boards/reproduction/{path.name}"} for path in _reproduction())],
+        "@reproduction": ["boards/reproduction/README.md",
+                          *({path.stem: f"boards/reproduction/{path.name}"} for path in _reproduction())],
         "@reference": [{title: f"reference/{_slug(title)}.md"} for title in REFERENCE],
     }  # fmt: skip
     config.nav = [{k: made[v] if isinstance(v, str) and v in made else v for k, v in item.items()} for item in config.nav]
@@ -69,7 +70,7 @@ def on_config(config: Any) -> Any:
 def on_files(files: Files, config: Any) -> Files:
     """Make them."""
     texts = {f"plants/{name}.md": data_sheet(load_plant(name)) for name in plant_sources()}
-    texts |= {"plants/index.md": plants(), "methods.md": methods(), "reproduction.md": reproduction()}
+    texts |= {"plants/index.md": plants(), "methods.md": methods()}
     texts |= {f"reference/{_slug(title)}.md": reference(title, modules) for title, modules in REFERENCE.items()}
     mirrored = {f"boards/{path.relative_to(BOARDS).as_posix()}": path for path in BOARDS.rglob("*.*")
                 if path.suffix in (".md", ".png") and path.name != "template.md"}  # fmt: skip
@@ -95,7 +96,7 @@ def _slug(title: str) -> str:
 
 
 def _reproduction() -> list[Path]:
-    return sorted((BOARDS / "reproduction").glob("*.md"))
+    return sorted(path for path in (BOARDS / "reproduction").glob("*.md") if path.name != "README.md")
 
 
 def _within(text: str, uri: str, known: set[str]) -> str:
@@ -229,13 +230,6 @@ def methods() -> str:
         parts += [f"## {family}", markdown(["name", "what it is", "settings"], rows)]
     trainers = [[f"`{name}`", plain(entry.summary)] for name, entry in diagnosis.trainers().items()]
     return "\n\n".join([*parts, "## Trainers", markdown(["name", "what it trains"], trainers)]) + "\n"
-
-
-def reproduction() -> str:
-    """The page that leads to the reproduction pages."""
-    links = "\n".join(f"- [{path.stem}](boards/reproduction/{path.name})" for path in _reproduction())
-    return ("# Reproduction\n\nThe published figures of each plant's source beside ours. `python -m "
-            f"benchmarks.reproduction.<plant>`, from a checkout, measures them again.\n\n{links}\n")  # fmt: skip
 
 
 def reference(title: str, modules: tuple[str, ...]) -> str:

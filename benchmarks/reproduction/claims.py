@@ -1,8 +1,8 @@
 """What a paper says beside what was measured, and a verdict that follows from the numbers.
 
-A claim has tests: a figure with its 95 % interval against a stated criterion. A figure whose whole interval meets the
+A claim has checks: a figure with its 95 % interval against a stated criterion. A figure whose whole interval meets the
 criterion confirms, one whose whole interval misses it does not, one whose interval holds the limit cannot be judged. A claim
-is confirmed where all its tests are, not confirmed where none is, partly between; a claim that the numbers at hand cannot
+is confirmed where all its checks are, not confirmed where none is, partly between; a claim that the numbers at hand cannot
 reach says so with a reason, and its figures are shown all the same.
 """
 
@@ -93,7 +93,7 @@ def paired_shares(first: Sequence[bool], second: Sequence[bool]) -> Measured:
     return Measured(difference, difference - half, difference + half, n)
 
 
-class Test(NamedTuple):
+class Check(NamedTuple):
     """A figure and its criterion."""
 
     what: str
@@ -135,15 +135,15 @@ class Found(dict[str, Any]):
         raise Missing(name)
 
 
-Tests = Callable[[Found], Sequence[Test]]
+Checks = Callable[[Found], Sequence[Check]]
 
 
 class Claim(NamedTuple):
-    """What a paper says, and the tests of it."""
+    """What a paper says, and the checks of it."""
 
     name: str  # "(a)", "Table 7"
     says: str
-    tests: Tests
+    checks: Checks
     why: str = ""
     pieces: str = ""  # `--only` that measures it again
     open: str = ""  # why it cannot be judged, whatever the figures
@@ -153,7 +153,7 @@ class Judged(NamedTuple):
     """A claim with its figures."""
 
     claim: Claim
-    tests: Sequence[Test]
+    checks: Sequence[Check]
     verdict: str
     why: str
 
@@ -161,11 +161,11 @@ class Judged(NamedTuple):
 def judge(claim: Claim, found: Found) -> Judged:
     """The verdict, from the figures alone."""
     try:
-        tests = claim.tests(found)
+        checks = claim.checks(found)
     except Missing as missing:
         return Judged(claim, (), OPEN, f"piece `{missing.args[0]}` is not measured")
-    verdict = OPEN if claim.open else together([t.verdict() for t in tests])
-    return Judged(claim, tests, verdict, ". ".join(part.rstrip(".") for part in (claim.open, claim.why) if part))
+    verdict = OPEN if claim.open else together([t.verdict() for t in checks])
+    return Judged(claim, checks, verdict, ". ".join(part.rstrip(".") for part in (claim.open, claim.why) if part))
 
 
 def together(verdicts: Sequence[str]) -> str:
@@ -190,13 +190,17 @@ def claims_table(judged: Sequence[Judged], command: str) -> str:
         name = f"'{j.claim.pieces}'" if " " in j.claim.pieces else j.claim.pieces
         again = f"`--only {name}`" if name else ""
         why = ". ".join(part for part in (j.why, again) if part)
-        rows.append([j.claim.name, j.claim.says, "; ".join(t.text() for t in j.tests) or "-", f"**{j.verdict}**", why])
+        rows.append([j.claim.name, j.claim.says, "; ".join(t.text() for t in j.checks) or "-", f"**{j.verdict}**", why])
     head = ["claim", "the paper", "measured here, 95 % interval (criterion)", "verdict", "why; how to measure it again"]
     return (
         f"Of {len(judged)} claims and printed figures: {counts(judged)}.\n\n{markdown(head, rows)}\n\n"
-        "A verdict follows from the figures: confirmed where the whole interval meets the criterion, not confirmed where "
-        "all of it misses it, partly where some of the tests are confirmed; a test whose interval holds its limit is open, "
-        "and a claim of open tests alone cannot be judged. A figure without an interval is computed, not sampled. "
+        "A verdict follows from the figures alone. A check is confirmed where its whole interval meets the criterion, "
+        "missed where "
+        "none of it does, open where the interval holds the limit. A claim is confirmed where all its checks are, partly "
+        "where some "
+        "are, not confirmed where none is and one is missed; where all are open it cannot be judged. A figure without an "
+        "interval is "
+        "computed, not sampled; checks of one claim are of the same flights. "
         f"`{command} --only NAME` measures the pieces of a row again, `{command} --page-only` renders the page.\n"
     )
 

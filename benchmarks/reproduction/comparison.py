@@ -43,8 +43,9 @@ class Comparisons:
 
     def summary(self) -> str:
         """How many agree."""
-        return (f"{sum(self.sets.values())} of {len(self.sets)} sets of flights agree in all their figures, "
-                f"{self.agree} of {self.total} figures; figures of one set are of the same flights and not independent.")  # fmt: skip
+        sets = f"{sum(self.sets.values())} of {len(self.sets)} sets of flights agree in all their figures"
+        figures = f"{self.agree} of {self.total} figures"
+        return f"{sets}, {figures}; figures of one set are of the same flights and not independent."
 
     def cell(self, reference: Figure, found: Figure, digits: int = 3, error: float = 0.0) -> str:
         """They agree within three standard errors of their difference and its rounding, or where neither is there."""

@@ -25,9 +25,9 @@ from fdi_gym.tables import markdown
 INTRODUCTION = """# Boeing 747: the paper's figures, measured again
 
 A. Guven, C. Hajiyev, [Two-Stage Kalman Filter Based Estimation of Boeing 747 Actuator/Control Surface Stuck
-Faults](https://doi.org/10.37394/232014.2023.19.4), WSEAS Transactions on Signal Processing 19, 2023. The paper gives A, B, the
-fault, and plots; sample time, noise, commands, the forgetting rule and the decision are this benchmark's, so what is judged
-here is what the paper's method does under them. What differs from the paper, and why: [differences](differences.md).
+Faults](https://doi.org/10.37394/232014.2023.19.4), WSEAS Transactions on Signal Processing 19, 2023. The paper gives A, B,
+the fault, and plots; sample time, noise, commands, the forgetting rule and the decision are this benchmark's, so what is
+judged here is what the paper's method does under them. What differs from the paper, and why: [differences](differences.md).
 """
 AGREEMENT = """## Agreement with a second implementation
 
@@ -98,7 +98,8 @@ def printed(found: Found) -> str:
         f"## Printed numbers\n\n{markdown(head, rows)}\n\nThe matrices, printed / from the derivatives of Table 1 (two "
         "entries of it repaired):\n\n"
         + markdown(["row", *names], a_rows) + "\n\n" + markdown(["row", "aileron", "rudder"], b_rows)
-        + f"\n\nThe yaw rows differ by one rudder feedback K = [{feedback}] on (beta, p, r, phi). The same K explains the first "
+        + f"\n\nThe yaw rows differ by one rudder feedback K = [{feedback}] on (beta, p, r, phi). The same K explains the "
+          "first "
         f"row of A to {p['feedback error']:.1e}, without a free parameter: the printed A is an airframe with an active yaw "
         "damper, and a rudder that is stuck in the paper keeps it.\n"
     )  # fmt: skip
@@ -108,7 +109,8 @@ def paper_figures(found: Found) -> str:
     """Figures 2 to 6"""
     found["figure"]
     return (
-        "## The paper's figures\n\nFigure 1 compares the paper's nonlinear model with the linear one; the paper does not give "
+        "## The paper's figures\n\nFigure 1 compares the paper's nonlinear model with the linear one; the paper does not "
+        "give "
         "that model, so the figure has no counterpart. One noise seed; the paper prints no values beside its plots.\n\n"
         "![Figure 2: inputs, the fault's entries and their errors](b747_lateral_faults.png)\n\n"
         "![Figures 3 to 6: the four states, true, with the two-stage filter and fault-blind](b747_lateral_states.png)\n\n"
@@ -128,7 +130,8 @@ def state_table(found: Found) -> str:
     rows.append(["the sensors", "faulty", *(mean(sensors[:, i].tolist()).text(4) for i in range(4))])
     head = ["filter", "window", "beta [deg]", "p [deg/s]", "r [deg/s]", "phi [deg]"]
     return (
-        "## State estimates\n\nRMSE over the paper's scenario: before the fault (50 to 200 s), while it acts (230 to 600 s), "
+        "## State estimates\n\nRMSE over the paper's scenario: before the fault (50 to 200 s), while it acts (230 to 600 "
+        "s), "
         f"after it (630 to 800 s).\n\n{markdown(head, rows)}\n"
     )
 

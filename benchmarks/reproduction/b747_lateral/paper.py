@@ -99,7 +99,8 @@ def confusion(method: str, per_group: int) -> dict[str, Any]:
     truth, declared = record.label[:, 1:].astype(int), said.label[:, 1:].astype(int)
     return {
         "samples": counts(truth, declared), "flights": counts(truth[:, -1], declared[:, -1]),
-        "names": [label.name for label in plant.labels], "n": len(scenarios), "faulty": int((onsets(scenarios) < 1200).sum()),
+        "names": [label.name for label in plant.labels], "n": len(scenarios),
+        "faulty": int((onsets(scenarios) < 1200).sum()),
     }  # fmt: skip
 
 

@@ -32,16 +32,16 @@ KIND_NAMES = ("bias", "stuck at", "stuck in place", "square", "drift", "loe")
 INTRODUCTION = """# Helicopter UAV in hover: the paper's claims and figures, measured again
 
 Z. Nejati et al., [Robust Three Stage Central Difference Kalman Filter for Helicopter Unmanned Aerial Vehicle Actuators Fault
-Estimation](https://doi.org/10.5829/ije.2021.34.05b.23), International Journal of Engineering, Transactions B 34(5), 2021. The
-paper prints figures and no numbers of results; parameters, controller, noise, sample time and gusts are this benchmark's, so
-what is judged here is what the paper's method does under them. What differs from the paper, and why:
+Estimation](https://doi.org/10.5829/ije.2021.34.05b.23), International Journal of Engineering, Transactions B 34(5), 2021.
+The paper prints figures and no numbers of results; parameters, controller, noise, sample time and gusts are this
+benchmark's, so what is judged here is what the paper's method does under them. What differs from the paper, and why:
 [differences](differences.md).
 """
 AGREEMENT = """## Agreement with a second implementation
 
 This says nothing of the paper: an independent implementation of the same data sheet with the same noise streams. Every cell
-reads "reference / measured here"; a star marks a difference beyond the rounding of the reference's last digit. Two accuracies
-of HypBank (a bank of ordinary Kalman filters, one per label) differ by a few samples in the fourth digit.
+reads "reference / measured here"; a star marks a difference beyond the rounding of the reference's last digit. Two
+accuracies of HypBank (a bank of ordinary Kalman filters, one per label) differ by a few samples in the fourth digit.
 """
 COMMAND = "python -m benchmarks.reproduction.huav_hover"
 
@@ -79,7 +79,8 @@ def agreement(found: Found) -> list[str]:
 def paper_figures(found: Found) -> str:
     """Figures 1 to 3"""
     text = (
-        "## The paper's figures\n\nThe paper shows, for each scenario, the true fault and the estimates of RThSCDKF and RThSEKF. "
+        "## The paper's figures\n\nThe paper shows, for each scenario, the true fault and the estimates of RThSCDKF and "
+        "RThSEKF. "
         "Below them are the gusts that act and the positions of the actuators, which the paper does not show; one flight "
         f"(noise seed {NOISE_SEEDS[0]}), kappa = 0.\n"
     )
@@ -102,7 +103,8 @@ def accuracy(found: Found) -> str:
     head = ["scenario", "filter", *(f"RMSE of b_{c} [mrad]" for c in SETS[3]), "faults flagged", "wrong flags"]
     return (
         "## Fault estimates\n\nRMSE of the raw estimate over 20 s in the paper's setting, mean over flights. Scenario 4 is "
-        f"scenario 1 with all filters. The filters see the same flights: their figures are paired.\n\n{markdown(head, rows)}\n"
+        "scenario 1 with all filters. The filters see the same flights: their figures are "
+        f"paired.\n\n{markdown(head, rows)}\n"
     )
 
 
@@ -118,7 +120,8 @@ def state_table(found: Found) -> str:
     head = ["scenario", "filter", *STATES]
     return (
         "## State estimates\n\nRMSE from 2 s on, mean over "
-        f"{len(found[f'states-1-{ROBUST[0]}']['states'])} flights, estimated together with the faults; velocities in m/s, rates in "
+        f"{len(found[f'states-1-{ROBUST[0]}']['states'])} flights, estimated together with the faults; velocities in m/s, "
+        "rates in "
         f"rad/s, angles in rad. The flapping angles are not measured.\n\n{markdown(head, rows)}\n"
     )
 
@@ -131,11 +134,16 @@ def applicability(found: Found) -> str:
             rows.append([SHORT[name], plant, mean(said["ratio"]).text(2) if "ratio" in said else said["reason"]])
     head = ["filter", "plant", "error in fault windows / that of estimating nothing; or why it cannot be built"]
     return (
-        "## Other plants\n\nAs each plant comes (the helicopter with kappa = 0.3 and all four channels), belief and thresholds "
-        f"fitted to its process.\n\n{markdown(head, rows)}\n\nThe three-stage filters take sensors y = H x. With nonlinear sensors "
-        "each stage would need its own linearisation of the sensors at the state that the other stages correct, and the decoupling "
-        "that makes the three stages equal to the augmented filter holds for one common H only; the paper's plant has linear sensors, "
-        "and no equation of it says which point to take. So they are not offered there: `augmented_cdkf` is the augmented filter "
+        "## Other plants\n\nAs each plant comes (the helicopter with kappa = 0.3 and all four channels), belief and "
+        "thresholds "
+        f"fitted to its process.\n\n{markdown(head, rows)}\n\nThe three-stage filters take sensors y = H x. With nonlinear "
+        "sensors "
+        "each stage would need its own linearisation of the sensors at the state that the other stages correct, and the "
+        "decoupling "
+        "that makes the three stages equal to the augmented filter holds for one common H only; the paper's plant has "
+        "linear sensors, "
+        "and no equation of it says which point to take. So they are not offered there: `augmented_cdkf` is the augmented "
+        "filter "
         "for such plants.\n"
     )
 

@@ -1,4 +1,4 @@
-"""The paper's own: Figures 1 to 3, states and faults together, decoupling, stress, other plants, the augmented filter's form."""
+"""The paper's own: Figures 1 to 3, states and faults together, decoupling, stress, other plants, the augmented form."""
 
 from __future__ import annotations
 
@@ -91,7 +91,8 @@ def stress(name: str, seeds: int) -> dict[str, Any]:
     w = show(diagnoser, plant, SETS[3], record.obs)
     error = w.b - record.target[:, 1:, [CHANNELS.index(c) for c in SETS[3]]]
     late = [error[i, EARLY : int(n)] for i, n in enumerate(record.length)]
-    return {"early": (rms(error[:, :EARLY], axis=1) / MRAD).tolist(), "late": [(rms(e, axis=0) / MRAD).tolist() for e in late],
+    return {"early": (rms(error[:, :EARLY], axis=1) / MRAD).tolist(), "late": [(rms(e,
+    axis=0) / MRAD).tolist() for e in late],
             "lost": int(record.terminated.sum())}  # fmt: skip
 
 

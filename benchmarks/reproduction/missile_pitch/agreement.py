@@ -26,7 +26,8 @@ class Statements:
         """How many hold, and all of them."""
         held = sum(row[-1] == "holds" for row in self.rows)
         table = markdown(["statement", "reference", "here", "verdict"], self.rows)
-        return f"**{held} of {len(self.rows)} statements hold; those of the numbered episodes are of the same flights.**\n\n{table}\n"
+        said = f"{held} of {len(self.rows)} statements hold; those of the numbered episodes are of the same flights."
+        return f"**{said}**\n\n{table}\n"
 
 
 def beside(reference: Iterable[float], found: Iterable[float], digits: int = 2) -> list[str]:

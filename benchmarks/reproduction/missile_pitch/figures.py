@@ -46,7 +46,8 @@ def figure_2(piece: dict[str, Any], said: dict[str, Any], title: str) -> Any:
     running = t >= said["T_d"] - 1e-9
     residual, threshold = np.abs(piece["residual"]), np.array(piece["lambda"])
     panels += [(axes[1, c], f"{'cd'[c]}: isolation estimator {c + 1} ({missile.MODES[c]}), pitch rate [rad/s]",
-                np.where(running, residual[:, c], np.nan), np.where(running, threshold[:, c], np.nan)) for c in (0, 1)]  # fmt: skip
+                np.where(running, residual[:, c], np.nan), np.where(running, threshold[:, c], np.nan)) for c in (0,
+                1)]  # fmt: skip
     for axis, words, solid, dashed in panels:
         marked(axis, times, words)
         above = drawn(axis, t, dashed, 1)
@@ -73,7 +74,8 @@ def equation_11(piece: dict[str, Any]) -> Any:
     for axis, (name, (_, title)) in zip(axes, NAMES.items(), strict=True):
         found = piece[name]
         t = np.arange(len(found["left"])) * 5 * DT
-        marked(axis, {"onset": ONSET, f"alarm {found['T_d']:.2f} s": found["T_d"], f"eq. 11 met {found['T_11']:.2f} s": found["T_11"]},
+        marked(axis, {"onset": ONSET, f"alarm {found['T_d']:.2f} s": found["T_d"],
+        f"eq. 11 met {found['T_11']:.2f} s": found["T_11"]},
                f"{title}: pitch rate [rad/s]")  # fmt: skip
         right = drawn(axis, t, found["right"], 1)
         left = drawn(axis, t, found["left"], 0)

@@ -19,9 +19,9 @@ from fdi_gym.tables import markdown
 
 INTRODUCTION = """# Pitch-axis missile: the study's claims and figures, measured again
 
-A journal article on adaptive fault detection and isolation for an aerocraft's nonlinear uncertain closed-loop system. The text
-at hand has lost its title page, its equations, Table 1 and the figures, so no link can be given; the scheme is that of X. Zhang,
-M. M. Polycarpou, T. Parisini, [IEEE TAC 47(4), 2002](https://doi.org/10.1109/9.995036). What was lost was taken from the
+A journal article on adaptive fault detection and isolation for an aerocraft's nonlinear uncertain closed-loop system. The
+text at hand has lost its title page, its equations, Table 1 and the figures, so no link to it can be given; the scheme is
+that of X. Zhang, M. M. Polycarpou, T. Parisini, IEEE TAC 47(4), 576-593, 2002. What was lost was taken from the
 literature that the study builds on or chosen: [differences](differences.md). So what is judged here is the scheme, not the
 study's figures.
 """
@@ -67,8 +67,10 @@ def study_figures(found: Found) -> str:
     """Figure 2"""
     found["study"], found["detectability"]
     return (
-        "## The study's figures\n\nFigure 1 is a diagram of the scheme. Figure 2: a the fault function and its approximation, b the "
-        "detection residual and its threshold, c and d the residuals of both isolation estimators and their adaptive thresholds. "
+        "## The study's figures\n\nFigure 1 is a diagram of the scheme. Figure 2: a the fault function and its "
+        "approximation, b the "
+        "detection residual and its threshold, c and d the residuals of both isolation estimators and their adaptive "
+        "thresholds. "
         "Beside them the two sides of equation 11. Noise-free, coefficients as the estimators have them.\n\n"
         "![Figure 2: type 1](missile_pitch.png)\n\n![The same for a fault of type 2](missile_pitch_mirror.png)\n\n"
         "![Equation 11: when a fault is detectable](missile_pitch_detectability.png)\n"
@@ -85,19 +87,21 @@ def state_table(found: Found) -> str:
     sensors = np.array(found[f"states {ESTIMATORS[0]}"]["sensors"])
     rows.append(["the sensors", *(mean(sensors[:, i].tolist()).text(4) for i in range(2))])
     return (
-        "## State estimates\n\nRMSE from 1 s on, mean over numbered episodes with faults and noise. The estimators of the scheme are "
-        "observers with a fixed gain: their residual is what the fault leaves, so their pitch rate is no better than the sensor.\n\n"
+        "## State estimates\n\nRMSE from 1 s on, mean over numbered episodes with faults and noise. The estimators of the "
+        "scheme are "
+        "observers with a fixed gain: their residual is what the fault leaves, so their pitch rate is no better than the "
+        "sensor.\n\n"
         + markdown(["method", "incidence [deg]", "pitch rate [deg/s]"], rows) + "\n"
     )  # fmt: skip
 
 
 GENERAL = """## The scheme on other plants
 
-The scheme is stated for any xdot = phi(x, u) + eta + B f with a known bound on eta. Here it needs three things of a plant: that
-bound as a function of what is measured, a fault function for each class that is linear in one parameter, and all states in
-motion measured. The missile has them (`baselines/filters/missile_model.py`); no other plant of the benchmark declares a bound on
-its model error, and a bound that is fitted to flights would void Theorem 1. So `approximation_detector` and `gos` are the
-missile's: what is missing is an
+The scheme is stated for any xdot = phi(x, u) + eta + B f with a known bound on eta. Here it needs three things of a plant:
+that bound as a function of what is measured, a fault function for each class that is linear in one parameter, and all
+states in motion measured. The missile has them (`baselines/filters/missile_model.py`); no other plant of the benchmark
+declares a bound on its model error, and a bound that is fitted to flights would void Theorem 1. So `approximation_detector`
+and `gos` are the missile's: what is missing is an
 entry for eta in `Plant`.
 """
 
