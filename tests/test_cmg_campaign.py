@@ -5,9 +5,10 @@ import itertools
 import numpy as np
 import pytest
 
-from benchmarks.reproduction.claims import Found, Missing, judge
+from benchmarks.reproduction.claims import Found, Missing, judge, share
 from benchmarks.reproduction.cmg_satellite.blocks import PER_LABEL, Block, block_piece, scenarios_of
 from benchmarks.reproduction.cmg_satellite.claims import CLAIMS
+from benchmarks.reproduction.cmg_satellite.earlier import accuracy
 from benchmarks.reproduction.cmg_satellite.outcomes import Said, hard_outcome, state_errors, window_outcome
 from benchmarks.reproduction.cmg_satellite.page import campaign
 from benchmarks.reproduction.cmg_satellite.paper import GRIDS, LEVELS
@@ -164,7 +165,8 @@ def pieces_of(blocks, wrong):
                   for b in blocks})  # fmt: skip
 
 
-def test_tables_of_the_campaign_say_how_many_flights_they_are_of():
+def test_tables_of_the_campaign_say_how_many_flights_they_are_of(monkeypatch):
+    monkeypatch.setattr("benchmarks.reproduction.cmg_satellite.earlier.EARLIER", {})
     found = pieces_of(campaign_blocks(False)[:9], {5})
     assert "15 flights of 1,500 in each cell (9 of 180 blocks" in campaign(found)
     assert "93.3 [70.2, 98.8], n = 15" in table_7(found)
@@ -177,8 +179,9 @@ def test_tables_of_the_campaign_say_how_many_flights_they_are_of():
 
 
 @pytest.mark.parametrize(("wrong", "verdict"), [(set(), "cannot be judged"), (set(range(2, 16)), "not confirmed")])
-def test_which_filter_is_ahead_is_decided_flight_by_flight(wrong, verdict):
+def test_which_filter_is_ahead_is_decided_flight_by_flight(wrong, verdict, monkeypatch):
     """Filters that are right alike cannot be told apart; one that errs where the other does not is not ahead."""
+    monkeypatch.setattr("benchmarks.reproduction.cmg_satellite.claims.accuracy", lambda *_: (share(300, 300), ""))
     (claim,) = (c for c in CLAIMS if c.name == "(a)")
     assert judge(claim, pieces_of(campaign_blocks(False)[:9], wrong)).verdict == verdict
 
@@ -191,3 +194,14 @@ def test_states_are_scored(plant):
     said.state[0, 500:, 4:7] += 0.25
     said.state[0, :500, 7:] += 9.0
     assert state_errors(record, said, 0) == pytest.approx([0.0, 0.25, 0.0])
+
+
+def test_what_an_earlier_run_measured_stands_in_and_is_marked():
+    """Until a block is measured again; then its flights count alone."""
+    value, mark = accuracy(Found(), "table5", "slew", 45, "SGAUKF")
+    assert (value.n, mark) == (135, " (earlier run)")
+    with pytest.raises(Missing):
+        accuracy(Found(), "table5", "regulate", 45, "CAUKF")
+    found = pieces_of(campaign_blocks(False)[:9], {5})
+    value, mark = accuracy(found, "table5", "slew", 45, "SGAUKF")
+    assert (value.n, value.value, mark) == (15, 14 / 15, "")

@@ -17,8 +17,12 @@ from fdi_gym.plants import cmg_satellite as cmg
 from fdi_gym.plots.panels import drawn, legend, new_figure, plain, truth
 
 
-def figure_3(piece: dict[str, Any], profile: str, path: Path) -> None:
-    """The whole time line, a row for each unit, and a zoom at each change beside it."""
+def figure_3(found: dict[str, Any], profile: str, path: Path) -> bool:
+    """The whole time line, a row for each unit, and a zoom at each change beside it; False while it is not measured."""
+    mine = {m: found.get(f"tracking-{profile}-{m}") for m in GRIDS}
+    if any(v is None for v in mine.values()):
+        return False
+    piece = {m: v["said"] for m, v in mine.items() if v} | {"truth": next(v["truth"] for v in mine.values() if v)}
     figure = new_figure(13.5, 7.2)
     grid = figure.add_gridspec(4, 1 + len(CHANGES), width_ratios=[3.2, *[1] * len(CHANGES)])
     handles: list[Any] = []
@@ -43,6 +47,7 @@ def figure_3(piece: dict[str, Any], profile: str, path: Path) -> None:
     legend(figure, handles)
     figure.suptitle(f"Figure 3: {profile}, 45 dB, one flight", fontsize=9, x=0.99, ha="right")
     figure.savefig(path)
+    return True
 
 
 def severity(r: Results, path: Path) -> bool:

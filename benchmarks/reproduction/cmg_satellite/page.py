@@ -6,9 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.reproduction.claims import Found, claims_table, judge, section
+from benchmarks.reproduction.claims import Found, Missing, claims_table, judge, section
 from benchmarks.reproduction.cmg_satellite import figures, source, tables
-from benchmarks.reproduction.cmg_satellite.claims import CLAIMS, results
+from benchmarks.reproduction.cmg_satellite.claims import CLAIMS
+from benchmarks.reproduction.cmg_satellite.earlier import results
+from benchmarks.reproduction.cmg_satellite.paper import GRIDS
 from benchmarks.reproduction.cmg_satellite.plan import CAMPAIGN, blocks, campaign_blocks
 from benchmarks.reproduction.cmg_satellite.results import Results
 
@@ -37,8 +39,7 @@ COMMAND = "python -m benchmarks.reproduction.cmg_satellite"
 def write(found: Found, quick: bool, path: Path) -> None:
     """The page and its figures."""
     for profile in ("slew", "regulate"):
-        if f"tracking-{profile}" in found:
-            figures.figure_3(found[f"tracking-{profile}"], profile, path.with_name(f"cmg_figure_3_{profile}.png"))
+        figures.figure_3(found, profile, path.with_name(f"cmg_figure_3_{profile}.png"))
     figures.severity(results(found), path.with_name("cmg_severity.png"))
     path.write_text(page(found, quick), encoding="utf-8")
 
@@ -47,7 +48,8 @@ def page(found: Found, quick: bool) -> str:
     """The whole page."""
     judged = [judge(claim, found) for claim in CLAIMS]
     parts = [INTRODUCTION, f"## Claims\n\n{claims_table(judged, COMMAND)}", "## The source's tables\n", campaign(found)]
-    own = (source.table_5, source.table_6, source.errors, source.table_7, source.table_8, source.table_9, source.table_10,
+    own = (source.table_5, source.table_6, source.errors, source.table_7, source.table_8, source.table_9, source.phases,
+    source.table_10,
            figure_3, source.states, source.literal)  # fmt: skip
     parts += [section(part, found) for part in own]
     return "\n".join([*parts, AGREEMENT, *agreement(found)])
@@ -67,19 +69,23 @@ def campaign(found: Found) -> str:
         "levels. "
         f"Measured here, on the slew: {done} flights of 1,500 in each cell ({len(there)} of {len(slew)} blocks, {CAMPAIGN} "
         "a cell). "
-        f"`{COMMAND} --only table5` goes on with it. Each table says its n.\n"
+        f"`{COMMAND} --only table5` goes on with it. Each table says its n; *earlier run* marks what an earlier run of "
+        "this command "
+        "measured, of the same processes and methods, and what has not been measured again (`earlier.toml`).\n"
     )
 
 
 def figure_3(found: Found) -> str:
     """Figure 3"""
-    found["tracking-slew"], found["tracking-regulate"]
+    profiles = [g for g in ("slew", "regulate") if all(f"tracking-{g}-{m}" in found for m in GRIDS)]
+    if not profiles:
+        raise Missing(f"tracking-slew-{GRIDS[0]}")
+    words = {"slew": "On the slew", "regulate": "As the source has it, regulating: the three filters stay at one"}
+    shown = "\n\n".join(f"{words[g]}:\n\n![Figure 3, {g}](cmg_figure_3_{g}.png)" for g in profiles)
     return (
         "## Figure 3\n\nEstimates of CAUKF, GAUKF and SGAUKF against the truth over Table 4, with zooms at the changes; 45 "
         "dB, one "
-        "flight. On the slew:\n\n![Figure 3, slew](cmg_figure_3_slew.png)\n\nAs the source has it, regulating: the three "
-        "filters stay "
-        "at one.\n\n![Figure 3, regulate](cmg_figure_3_regulate.png)\n"
+        f"flight. {shown}\n"
     )
 
 

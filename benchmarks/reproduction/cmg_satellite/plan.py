@@ -39,7 +39,7 @@ TRIED: dict[str, tuple[dict[str, Any], float, dict[str, Any]]] = {
 def plan(quick: bool) -> Jobs:
     """All pieces: the source's own, the time line that its tables are of, its campaign, and then the rest."""
     count = 2 if quick else 8
-    jobs = own_plan() | {b.name(): (block_piece, (b,)) for b in blocks(quick)}
+    jobs = own_plan(quick) | {b.name(): (block_piece, (b,)) for b in blocks(quick)}
     for g, levels in REFERENCE["bound"].items():
         for s in levels:
             for onset in BOUND_ONSETS:
@@ -67,12 +67,11 @@ def campaign_blocks(quick: bool) -> list[Block]:
 
 
 def blocks(quick: bool) -> list[Block]:
-    """The blocks of the page, Table 4's time line and the source's campaign first; one of each kind for a quick run."""
+    """The blocks of the page, the source's campaign first; one of each kind for a quick run."""
 
     def several(n: int) -> range:
         return range(1 if quick else n)
 
-    first = [Block("table4", g, s, m) for g in ("slew", "regulate") for s in LEVELS for m in (*GRIDS, "UKF")]
     grids = [Block("bench", "slew", s, m, b) for s in LEVELS for m in GRIDS for b in several(4)]
     slew = REFERENCE["table_4"]["slew"]
     table4 = [Block("table4", "slew", s, m) for s in LEVELS for m in slew]
@@ -93,8 +92,7 @@ def blocks(quick: bool) -> list[Block]:
     ranges = [
         Block("table5", g, int(s), m) for g, levels in REFERENCE["table_5"].items() for s, row in levels.items() for m in row
     ]
-    own = first + campaign_blocks(quick)
-    return list(dict.fromkeys(own + grids + table4 + hard + severity + bench + settings + ranges))
+    return list(dict.fromkeys(campaign_blocks(quick) + grids + table4 + hard + severity + bench + settings + ranges))
 
 
 def bound_piece(profile: str, snr: int, onset: int, count: int, excitation: str = "none") -> list[list[list[float]]]:

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.reproduction.claims import Missing, share
+from benchmarks.reproduction.claims import Found, Missing, share
 from benchmarks.reproduction.cmg_satellite.blocks import Block
+from benchmarks.reproduction.cmg_satellite.paper import PARTS
 from benchmarks.reproduction.comparison import Comparisons, Figure, shown
 from fdi_gym.plant import Array
 from fdi_gym.plants import cmg_satellite as cmg
@@ -84,6 +85,19 @@ class Results:
         given = 100 * np.array(shares)
         error = given.std(ddof=1) / math.sqrt(len(given))
         return f"{self.t.cell(reference, given.mean(), 1, math.hypot(half / 1.96, error))} +- {1.96 * error:.1f}"
+
+
+def line(found: Found, profile: str, snr: int, methods: Sequence[str]) -> list[Outcomes]:
+    """The flights of Table 4 that all of these have been shown; "literal odd" and the like are readings of SGAUKF.
+
+    Raises:
+        Missing: There is none.
+    """
+    names = [m.replace(" ", "-", 1) if m.startswith("literal ") else f"line-{profile}-{snr}-{m}" for m in methods]
+    parts = [part for part in range(PARTS) if all(f"{name}-{part}" in found for name in names)]
+    if not parts:
+        raise Missing(next((f"{n}-0" for n in names if f"{n}-0" not in found), f"{names[0]}-0"))
+    return [[o for part in parts for o in found[f"{name}-{part}"]["outcomes"]] for name in names]
 
 
 def column(outcomes: Outcomes, name: str) -> list[Any]:
