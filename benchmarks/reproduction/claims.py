@@ -67,7 +67,8 @@ def mean(values: Iterable[float | None]) -> Measured:
 def ratio(above: Sequence[float], below: Sequence[float]) -> Measured:
     """Ratio of two means over the same flights, from the logarithms of their paired ratios."""
     logs = mean(np.log(np.array(above, float) / np.array(below, float)).tolist())
-    return Measured(*(math.exp(v) if math.isfinite(v) else math.inf * (v > 0) for v in logs[:3]), logs.n)
+    value, low, high = (math.exp(v) if math.isfinite(v) else math.inf * (v > 0) for v in logs[:3])
+    return Measured(value, low, high, logs.n)
 
 
 def share(hits: int, n: int) -> Measured:

@@ -50,7 +50,8 @@ def inputs_and_faults(piece: dict[str, Any]) -> Any:
         error.set_linestyle("-")
     for axis in axes[-1]:
         axis.set_xlabel("time [s]", fontsize=8)
-    ink.set_label("true"), estimate.set_label("two-stage, forgetting 0.99"), error.set_label("estimate - true")
+    for handle, words in ((ink, "true"), (estimate, "two-stage, forgetting 0.99"), (error, "estimate - true")):
+        handle.set_label(words)
     legend(figure, [ink, estimate, error, shade_handle("the rudder is stuck at 2 deg")])
     return figure
 
@@ -77,6 +78,7 @@ def states(piece: dict[str, Any]) -> Any:
         drawn(axes[row, 2], t, said[:, i] - true[:, i], 0, lw=0.5)
     for axis in axes[-1]:
         axis.set_xlabel("time [s]", fontsize=8)
-    ink.set_label("true"), with_filter.set_label("two-stage, forgetting 0.99"), lost.set_label("fault-blind Kalman filter")
+    for handle, words in ((ink, "true"), (with_filter, "two-stage, forgetting 0.99"), (lost, "fault-blind Kalman filter")):
+        handle.set_label(words)
     legend(figure, [ink, with_filter, lost, shade_handle("the rudder is stuck at 2 deg")])
     return figure

@@ -107,7 +107,7 @@ def printed(found: Found) -> str:
 
 def paper_figures(found: Found) -> str:
     """Figures 2 to 6"""
-    found["figure"]
+    _ = found["figure"]  # what the pictures are made of
     return (
         "## The paper's figures\n\nFigure 1 compares the paper's nonlinear model with the linear one; the paper does not "
         "give "

@@ -48,8 +48,9 @@ def printed() -> dict[str, Any]:
     bare_A, bare_B = b747.bare_airframe()
     powers = [np.linalg.matrix_power(A, i) for i in range(4)]
     found = np.linalg.eigvals(A)
-    printed_modes = PRINTED_MODES[np.argsort(PRINTED_MODES.real + 1e-3 * PRINTED_MODES.imag)]
-    ours = found[np.argsort(found.real + 1e-3 * found.imag)]
+    printed_modes, ours = (
+        np.array(sorted(modes.tolist(), key=lambda v: (round(v.real, 3), v.imag))) for modes in (PRINTED_MODES, found)
+    )
     bare = np.linalg.eigvals(bare_A)
     K = (A[2] - bare_A[2]) / B[2, 1]  # the rudder feedback that the yaw row holds
     entries = [(A, bare_A), (B, bare_B)]

@@ -85,7 +85,7 @@ def paper_figures(found: Found) -> str:
         f"(noise seed {NOISE_SEEDS[0]}), kappa = 0.\n"
     )
     for number in NUMBERS:
-        found[f"figure-{number}"]
+        _ = found[f"figure-{number}"]  # what the picture is made of
         text += f"\n![Figure {number}: {figures.TITLES[number]}](huav_hover_figure_{number}.png)\n"
     return text
 

@@ -80,6 +80,7 @@ def equation_11(piece: dict[str, Any]) -> Any:
         right = drawn(axis, t, found["right"], 1)
         left = drawn(axis, t, found["left"], 0)
         axis.set_xlabel("time [s]", fontsize=8)
-    left.set_label("|filtered fault function|"), right.set_label("twice the threshold")
+    left.set_label("|filtered fault function|")
+    right.set_label("twice the threshold")
     legend(figure, [left, right])
     return figure
