@@ -42,10 +42,10 @@ COMMAND = "python -m benchmarks.reproduction.b747_lateral"
 
 def write(found: Found, quick: bool, path: Path) -> None:
     """The page and its pictures."""
+    path.write_text(page(found, quick), encoding="utf-8")
     picture(path.with_name("rudder.png"))
     if "figure" in found:
         figures.write(found["figure"], path.parent)
-    path.write_text(page(found, quick), encoding="utf-8")
 
 
 def page(found: Found, quick: bool) -> str:

@@ -38,10 +38,10 @@ COMMAND = "python -m benchmarks.reproduction.cmg_satellite"
 
 def write(found: Found, quick: bool, path: Path) -> None:
     """The page and its figures."""
+    path.write_text(page(found, quick), encoding="utf-8")
     for profile in ("slew", "regulate"):
         figures.figure_3(found, profile, path.with_name(f"cmg_figure_3_{profile}.png"))
     figures.severity(results(found), path.with_name("cmg_severity.png"))
-    path.write_text(page(found, quick), encoding="utf-8")
 
 
 def page(found: Found, quick: bool) -> str:

@@ -48,10 +48,10 @@ COMMAND = "python -m benchmarks.reproduction.huav_hover"
 
 def write(found: Found, quick: bool, path: Path) -> None:
     """The page and its figures."""
+    path.write_text(page(found, quick), encoding="utf-8")
     for number in NUMBERS:
         if f"figure-{number}" in found:
             figures.write(found[f"figure-{number}"], number, path.with_name(f"huav_hover_figure_{number}.png"))
-    path.write_text(page(found, quick), encoding="utf-8")
 
 
 def page(found: Found, quick: bool) -> str:

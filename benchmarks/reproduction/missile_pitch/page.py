@@ -35,9 +35,9 @@ COMMAND = "python -m benchmarks.reproduction.missile_pitch"
 
 def write(found: Found, quick: bool, path: Path) -> None:
     """The page and its figures."""
+    path.write_text(page(found, quick), encoding="utf-8")
     if "study" in found and "detectability" in found:
         figures.write(found, path.parent)
-    path.write_text(page(found, quick), encoding="utf-8")
 
 
 def page(found: Found, quick: bool) -> str:
