@@ -61,7 +61,8 @@ def on_config(config: Any) -> Any:
                     {"Learned": "boards/learning/README.md"}, {"Coverage of the intervals": "boards/coverage.md"},
                     {"Acting": "boards/acting.md"},
                     *({path.stem: f"boards/{path.name}"} for path in sorted(BOARDS.glob("*-*.md")))],
-        "@reproduction": ["reproduction.md", *({path.stem: f"boards/reproduction/{path.name}"} for path in _reproduction())],
+        "@reproduction": ["boards/reproduction/README.md",
+                          *({path.stem: f"boards/reproduction/{path.name}"} for path in _reproduction())],
         "@reference": [{title: f"reference/{_slug(title)}.md"} for title in REFERENCE],
     }  # fmt: skip
     config.nav = [{k: made[v] if isinstance(v, str) and v in made else v for k, v in item.items()} for item in config.nav]
@@ -73,7 +74,7 @@ def on_files(files: Files, config: Any) -> Files:
     texts = {f"plants/{name}.md": data_sheet(load_plant(name)) for name in plant_sources()}
     texts |= {f"suites/{name}.md": suite_sheet(load_suite(name)) for name in suite_names()}
     texts |= {"suites/index.md": suites(), "origins.md": origins()}
-    texts |= {"plants/index.md": plants(), "methods.md": methods(), "reproduction.md": reproduction()}
+    texts |= {"plants/index.md": plants(), "methods.md": methods()}
     texts |= {f"reference/{_slug(title)}.md": reference(title, modules) for title, modules in REFERENCE.items()}
     mirrored = {f"boards/{path.relative_to(BOARDS).as_posix()}": path for path in BOARDS.rglob("*.*")
                 if path.suffix in (".md", ".png") and path.name != "template.md"}  # fmt: skip
@@ -99,7 +100,7 @@ def _slug(title: str) -> str:
 
 
 def _reproduction() -> list[Path]:
-    return sorted((BOARDS / "reproduction").glob("*.md"))
+    return sorted(path for path in (BOARDS / "reproduction").glob("*.md") if path.name != "README.md")
 
 
 def _within(text: str, uri: str, known: set[str]) -> str:
@@ -139,13 +140,6 @@ def _front(text: str, reports: list[str]) -> str:
 
 # ---------------------------------------------------------------------------------------------------------------
 # Pages that lead to others
-
-
-def reproduction() -> str:
-    """The page that leads to the reproduction pages."""
-    links = "\n".join(f"- [{path.stem}](boards/reproduction/{path.name})" for path in _reproduction())
-    return ("# Reproduction\n\nThe published figures of each plant's source beside ours. `python -m "
-            f"benchmarks.reproduction.<plant>`, from a checkout, measures them again.\n\n{links}\n")  # fmt: skip
 
 
 def reference(title: str, modules: tuple[str, ...]) -> str:

@@ -5,11 +5,15 @@ import itertools
 import numpy as np
 import pytest
 
+from benchmarks.reproduction.claims import Found, Missing, judge, share
 from benchmarks.reproduction.cmg_satellite.blocks import PER_LABEL, Block, block_piece, scenarios_of
-from benchmarks.reproduction.cmg_satellite.campaign import VARIANTS, campaign
-from benchmarks.reproduction.cmg_satellite.outcomes import Said, hard_outcome, window_outcome
-from benchmarks.reproduction.cmg_satellite.plan import GRIDS, LEVELS, blocks, is_campaign
-from benchmarks.reproduction.cmg_satellite.results import Results
+from benchmarks.reproduction.cmg_satellite.claims import CLAIMS
+from benchmarks.reproduction.cmg_satellite.earlier import accuracy
+from benchmarks.reproduction.cmg_satellite.outcomes import Said, hard_outcome, state_errors, window_outcome
+from benchmarks.reproduction.cmg_satellite.page import campaign
+from benchmarks.reproduction.cmg_satellite.paper import GRIDS, LEVELS
+from benchmarks.reproduction.cmg_satellite.plan import blocks, campaign_blocks, is_campaign, plan
+from benchmarks.reproduction.cmg_satellite.source import errors, table_6, table_7
 from benchmarks.reproduction.pieces import pieces
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
@@ -27,7 +31,16 @@ def perfect(record, flags=()):
     n, samples = record.label.shape
     flag = np.zeros((n, samples), bool)
     flag[:, list(flags)] = True
-    return Said(record.theta.copy(), record.label.copy(), np.zeros((n, samples)), flag, np.zeros(n, int), 0.0)
+    return Said(
+        record.theta.copy(),
+        record.label.copy(),
+        np.zeros((n, samples)),
+        flag,
+        np.zeros(n, int),
+        0.0,
+        np.zeros(n, int),
+        record.state.copy(),
+    )
 
 
 def test_window_bookkeeping(plant):
@@ -126,26 +139,69 @@ def test_hard_at_45_db(method, sample):
     assert abs(found.mean() - sample) < 3 * found.std(ddof=1) * np.sqrt(1 / 60 + 1 / len(found))
 
 
-def test_the_plan_holds_the_campaign_and_no_block_twice():
-    """300 episodes at least of each of the source's filters at each of its noise levels, before all else."""
+def test_the_plan_holds_the_source_s_campaign_and_no_block_twice():
+    """1,500 flights of each of the source's filters at each of its noise levels, 100 of each label, as many at any time."""
     planned = blocks(quick=False)
     assert len(planned) == len(set(planned))
-    head = [b for b in planned if is_campaign(b)]
-    assert planned[: len(head)] == head
+    assert {b.name() for b in planned} <= set(plan(False))
+    mine = [b for b in campaign_blocks(False) if is_campaign(b)]
     for snr, method in itertools.product(LEVELS, GRIDS):
-        assert sum(b.snr == snr and b.method == method for b in head) * 15 * PER_LABEL["bench"] >= 300
+        assert sum(b.snr == snr and b.method == method for b in mine) * 15 * PER_LABEL["table5"] == 1500
+    cells = len(LEVELS) * len(GRIDS)
+    for begin in range(0, len(mine), cells):
+        assert {b[2:4] for b in mine[begin : begin + cells]} == set(itertools.product(LEVELS, GRIDS))
+        assert len({b.number for b in mine[begin : begin + cells]}) == 1
 
 
-def test_sections_of_the_campaign():
-    """Accuracy, errors and cost from outcomes: one of 15 labels wrong, by one unit."""
+def outcomes(wrong):
+    """One flight of each label, the given ones said to be of label 1."""
     o = {"pre": 0.1, "faulty": 0.2, "post": None, "scored": 0.9, "steps": 100}
-    outcomes = [o | {"truth": i, "decided": 1 if i == 5 else i} for i in range(1, 16)]
-    found = {
-        Block(variant, "slew", snr, m): {"outcomes": outcomes, "seconds": seconds, "samples": 15}
-        for variant, snr, (m, seconds) in itertools.product(VARIANTS, LEVELS, zip(GRIDS, (3.0, 2.0, 1.0), strict=True))
-    }
-    text = campaign(Results(found))
-    assert "93.3 [70.2, 98.8], n = 15" in text
-    assert "|5{1,2}|.|1|.|.|.|.|" in text.replace(" ", "")
-    assert "|GAUKF|45|15|1|0|1|0|" in text.replace(" ", "")
-    assert "3.00 : 2.00 : 1.00" in text
+    return [o | {"truth": i, "decided": 1 if i in wrong else i} for i in range(1, 16)]
+
+
+def pieces_of(blocks, wrong):
+    """Pieces in which SGAUKF errs at some labels and the others never."""
+    return Found({b.name(): {"outcomes": outcomes(wrong if b.method == "SGAUKF" else ()), "seconds": 1.0, "samples": 15}
+                  for b in blocks})  # fmt: skip
+
+
+def test_tables_of_the_campaign_say_how_many_flights_they_are_of(monkeypatch):
+    monkeypatch.setattr("benchmarks.reproduction.cmg_satellite.earlier.EARLIER", {})
+    found = pieces_of(campaign_blocks(False)[:9], {5})
+    assert "15 flights of 1,500 in each cell (9 of 180 blocks" in campaign(found)
+    assert "93.3 [70.2, 98.8], n = 15" in table_7(found)
+    assert "5{1,2}|90|0.00[0.00,0.79],n=1|.|1|.|.|.|.|" in table_6(found).replace(" ", "")
+    assert "|SGAUKF|45|15|1|0|1|0|" in errors(found).replace(" ", "")
+    more = pieces_of(campaign_blocks(False)[:10], {5})
+    assert "15 flights of 1,500" in campaign(more)  # the tenth is of the source's own case
+    with pytest.raises(Missing, match="table5-slew"):
+        errors(Found())
+
+
+@pytest.mark.parametrize(("wrong", "verdict"), [(set(), "cannot be judged"), (set(range(2, 16)), "not confirmed")])
+def test_which_filter_is_ahead_is_decided_flight_by_flight(wrong, verdict, monkeypatch):
+    """Filters that are right alike cannot be told apart; one that errs where the other does not is not ahead."""
+    monkeypatch.setattr("benchmarks.reproduction.cmg_satellite.claims.accuracy", lambda *_: (share(300, 300), ""))
+    (claim,) = (c for c in CLAIMS if c.name == "(a)")
+    assert judge(claim, pieces_of(campaign_blocks(False)[:9], wrong)).verdict == verdict
+
+
+def test_states_are_scored(plant):
+    """RMSE of attitude, rate and gimbal angles from 5 s on, of the parts that an error is put into."""
+    record = simulate(plant, [cmg.table4("slew").replace(steps=1500, faults=[])])
+    said = perfect(record)
+    assert state_errors(record, said, 0) == [0.0, 0.0, 0.0]
+    said.state[0, 500:, 4:7] += 0.25
+    said.state[0, :500, 7:] += 9.0
+    assert state_errors(record, said, 0) == pytest.approx([0.0, 0.25, 0.0])
+
+
+def test_what_an_earlier_run_measured_stands_in_and_is_marked():
+    """Until a block is measured again; then its flights count alone."""
+    value, mark = accuracy(Found(), "table5", "slew", 45, "SGAUKF")
+    assert (value.n, mark) == (135, " (earlier run)")
+    with pytest.raises(Missing):
+        accuracy(Found(), "table5", "regulate", 45, "CAUKF")
+    found = pieces_of(campaign_blocks(False)[:9], {5})
+    value, mark = accuracy(found, "table5", "slew", 45, "SGAUKF")
+    assert (value.n, value.value, mark) == (15, 14 / 15, "")

@@ -54,7 +54,7 @@ def test_two_stage_equals_the_papers_on_the_linear_plant(b747):
     record = flights_of(b747, "standard", 400_000, FLIGHTS, True)[1]
     model = model_of(b747, x0_std=[0.1] * 4, z0_std=[1, 1, 2, 2], z_walk=[1e-3] * 4)
     model = model.replace(limit=np.full(8, np.inf))
-    own = papers_two_stage(b747, aging(b747, 1e-6, "none", 0.99, 1e-4, 1.0))
+    own = papers_two_stage(b747, aging(1e-6, "none", 0.99, 1e-4, 1.0))
     obs = record.obs[:, :400]
     for a, b in zip(readings(b747, two_stage_filter(model, first_sample=False), obs), readings(b747, own, obs), strict=True):
         for name in ("z", "P", "x"):

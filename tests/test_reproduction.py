@@ -1,15 +1,35 @@
-"""The papers' figures measured again: what is printed has a source, finished pieces are kept, stars mean what they say."""
+"""The papers' figures measured again: verdicts follow from figures, pages from pieces, and stars mean what they say."""
 
+import importlib
 import math
+import re
 import runpy
 import sys
 
 import pytest
 from conftest import ROOT
 
+from benchmarks.reproduction import index
+from benchmarks.reproduction.claims import (
+    CONFIRMED,
+    NOT_CONFIRMED,
+    OPEN,
+    PARTLY,
+    Check,
+    Claim,
+    Found,
+    Measured,
+    exact,
+    judge,
+    mean,
+    paired_shares,
+    ratio,
+    share,
+    together,
+)
 from benchmarks.reproduction.comparison import Comparisons
 from benchmarks.reproduction.missile_pitch.measure import numbered, unclipped
-from benchmarks.reproduction.pieces import finished, pieces, reference
+from benchmarks.reproduction.pieces import finished, keep, kept, pieces, reference, rounded
 from fdi_gym.files import read_json
 from fdi_gym.suite import load_suite, suite_names
 
@@ -65,11 +85,125 @@ def test_finished_pieces_are_kept_and_damaged_ones_made_again(tmp_path):
     assert read_json(tmp_path / "a_1.json", dict, "piece")["number"] == 1
 
 
-def test_a_page_of_pieces_that_are_missing_is_refused(tmp_path, monkeypatch):
+def test_a_page_of_no_pieces_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["-", "--page-only", "--quick", "--work", str(tmp_path), "--pages", str(tmp_path)])
-    with pytest.raises(SystemExit, match="pieces are not finished"):
+    with pytest.raises(SystemExit, match="no piece is finished"):
         runpy.run_module("benchmarks.reproduction.huav_hover", run_name="__main__")
     assert not list(tmp_path.rglob("*.md"))
+
+
+PAGES = ROOT / "leaderboards" / "reproduction"
+LETTERS = {"b747_lateral": "abcde", "huav_hover": "abcdef", "missile_pitch": "abcd", "cmg_satellite": "abcde"}
+
+
+def page_of(name, found):
+    return importlib.import_module(f"benchmarks.reproduction.{name}.page").page(found, False)
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_page_follows_from_the_pieces_beside_it(name):
+    found = kept(PAGES, name)
+    assert found
+    assert (PAGES / f"{name}.md").read_text(encoding="utf-8") == page_of(name, found)
+
+
+def test_the_index_and_the_differences_follow_from_the_same():
+    assert (PAGES / "README.md").read_text(encoding="utf-8") == index.index(PAGES)
+    assert (PAGES / "differences.md").read_text(encoding="utf-8") == index.differences()
+    assert index.plants() == FOLDERS == sorted(index.NAMES)
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_page_of_no_pieces_judges_nothing_and_says_what_it_waits_for(name, monkeypatch):
+    """What needs a piece is open without it; no figure is in the code. (An earlier run's figures are data, too.)"""
+    monkeypatch.setattr("benchmarks.reproduction.cmg_satellite.earlier.EARLIER", {})
+    text = page_of(name, Found())
+    for claim in index.claims(name):
+        if claim.pieces:
+            judged = judge(claim, Found())
+            assert judged.verdict == OPEN
+            assert "is not measured" in judged.why
+    assert "is not measured" in text
+    assert not re.search(r"n = [1-9]", text.partition("## Agreement")[0])
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_every_claim_of_a_paper_is_judged_and_says_which_pieces_to_measure(name):
+    names = [claim.name for claim in index.claims(name)]
+    assert {f"({letter})" for letter in LETTERS[name]} <= set(names)
+    planned = runpy.run_module(f"benchmarks.reproduction.{name}")["plan"](False)
+    for claim in index.claims(name):
+        assert claim.says
+        assert not claim.pieces or any(job.startswith(claim.pieces) for job in planned)
+
+
+@pytest.mark.parametrize("name", [*FOLDERS, "README", "differences"])
+def test_pictures_and_pages_that_a_page_names_are_there(name):
+    text = (PAGES / f"{name}.md").read_text(encoding="utf-8")
+    targets = [t for t in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in t]
+    assert targets
+    assert all((PAGES / target).is_file() for target in targets)
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_differences_say_what_is_printed_what_is_flown_and_why(name):
+    citation, found = index.differences_of(name)
+    assert citation
+    assert len(found) > 10
+    assert all(all(difference) for difference in found)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "verdict"),
+    [(1.1, 1.9, CONFIRMED), (1.0, 2.0, CONFIRMED), (0.9, 1.5, OPEN), (1.5, 2.1, OPEN), (0.0, 0.9, NOT_CONFIRMED),
+     (2.1, 3.0, NOT_CONFIRMED)],
+)  # fmt: skip
+def test_a_verdict_is_where_the_interval_lies(low, high, verdict):
+    measured = Measured((low + high) / 2, low, high, 5)
+    assert Check("x", measured, 1.0, 2.0).verdict() == verdict
+    assert Check("x", Measured(math.nan, -math.inf, math.inf), 1.0, 2.0).verdict() == OPEN
+    mirrored = Measured(-measured.value, -high, -low, 5)
+    assert Check("x", mirrored, -2.0, -1.0).verdict() == verdict
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "one"),
+    [([], OPEN), ([OPEN, OPEN], OPEN), ([CONFIRMED] * 3, CONFIRMED), ([CONFIRMED, OPEN], PARTLY),
+     ([CONFIRMED, NOT_CONFIRMED], PARTLY), ([NOT_CONFIRMED, OPEN], NOT_CONFIRMED)],
+)  # fmt: skip
+def test_a_claim_is_confirmed_where_all_its_tests_are(verdicts, one):
+    assert together(verdicts) == one
+
+
+def test_a_claim_that_the_figures_cannot_reach_stays_open():
+    checks = [Check("x", exact(1.0), 0.0, 2.0)]
+    assert judge(Claim("(x)", "x", lambda found: checks), Found()).verdict == CONFIRMED
+    judged = judge(Claim("(x)", "x", lambda found: checks, open="calibrated"), Found())
+    assert (judged.verdict, judged.checks, judged.why) == (OPEN, checks, "calibrated")
+
+
+def test_intervals_hold_what_they_should():
+    """Wilson's and Student's by hand; pairs that agree differ by nothing, whatever their share."""
+    assert share(0, 200) == pytest.approx((0.0, 0.0, 0.01885, 200), abs=1e-5)
+    assert share(81, 263)[1:3] == pytest.approx((0.2553, 0.3662), abs=1e-4)
+    assert mean([1.0, 2.0, None, 3.0]) == pytest.approx(
+        (2.0, 2.0 - 4.302653 / math.sqrt(3), 2.0 + 4.302653 / math.sqrt(3), 3)
+    )
+    assert ratio([2.0, 4.0, 8.0], [1.0, 2.0, 4.0]) == pytest.approx((2.0, 2.0, 2.0, 3))
+    some = [True, False] * 50
+    assert paired_shares(some, some).value == 0.0
+    first = paired_shares([True] * 60 + [False] * 40, [True] * 40 + [False] * 60)
+    assert first.value == pytest.approx(0.2)
+    assert 0.0 < first.low < 0.2 < first.high
+    back = paired_shares([True] * 40 + [False] * 60, [True] * 60 + [False] * 40)
+    assert (back.value, back.low) == pytest.approx((-first.value, -first.high))
+
+
+def test_pieces_beside_a_page_are_kept_to_nine_digits(tmp_path):
+    found = rounded({"a": [1 / 3, {"b": 2 / 3e9}], "n": 3, "none": None, "text": "x"})
+    keep(tmp_path, "x", found)
+    assert kept(tmp_path, "x") == found == {"a": [0.333333333, {"b": 6.66666667e-10}], "n": 3, "none": None, "text": "x"}
+    assert kept(tmp_path, "y") == {}
 
 
 @pytest.mark.parametrize(
@@ -97,6 +231,14 @@ def test_counts_are_whole():
     assert t.counts([3, 4], [2, 4]) == "3/4 but 2/4 *"
     assert t.cells([1.0, 2.0], [1.0, 3.0], 0) == "1 / 1, 2 / 3 *"
     assert (t.agree, t.total) == (2, 4)
+
+
+def test_figures_of_the_same_flights_are_counted_as_one_set():
+    t = Comparisons()
+    for flights, found in (("a", 1.0), ("a", 1.0), ("b", 1.0), ("b", 2.0), ("a", 1.0)):
+        t.of(flights)
+        t.cell(1.0, found)
+    assert t.summary().startswith("1 of 2 sets of flights agree in all their figures, 4 of 5 figures")
 
 
 @pytest.mark.slow

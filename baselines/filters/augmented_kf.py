@@ -79,5 +79,5 @@ def augmented_kf(
     position: Mapping[str, float] | None = None,
 ) -> Diagnoser:
     """The augmented Kalman filter; arguments and errors as of `two_stage_kf`."""
-    filter = augmented_filter(plant, aging(plant, q_bias, forgetting, factor, a_min, a_max))
+    filter = augmented_filter(plant, aging(q_bias, forgetting, factor, a_min, a_max))
     return diagnoser_of(plant, filter, decision_rule(plant, decision, threshold, release_after, position))

@@ -45,7 +45,7 @@ def restart_kf(
     Raises:
         NotApplicableError: The plant is nonlinear.
     """
-    detector = two_stage_filter(plant, aging(plant, 0.0, "exponential", factor, 0.0, a_max))
+    detector = two_stage_filter(plant, aging(0.0, "exponential", factor, 0.0, a_max))
     second = two_stage_filter(plant, lambda Pz: Pz)
     rule, sets = decision_rule(plant, "distance", threshold, release_after), manifolds(plant)
     P_x, P_z = initial_covariances(plant)

@@ -72,9 +72,7 @@ def forget(Pz: Array, rule: str, factor: float, a_min: float, a_max: float, q_bi
     return aged
 
 
-def aging(
-    plant: Plant, q_bias: float, forgetting: str, factor: float, a_min: float, a_max: float
-) -> Callable[[Array], Array]:
+def aging(q_bias: float, forgetting: str, factor: float, a_min: float, a_max: float) -> Callable[[Array], Array]:
     """The time update Pz -> Pz- of a filter: forgetting, then a random walk of variance q_bias per step.
 
     Raises:
@@ -219,5 +217,5 @@ def two_stage_kf(
         NotApplicableError: The plant is nonlinear, or fixed thresholds have no positions.
         ValueError: Unknown forgetting rule or decision.
     """
-    filter = two_stage_filter(plant, aging(plant, q_bias, forgetting, factor, a_min, a_max))
+    filter = two_stage_filter(plant, aging(q_bias, forgetting, factor, a_min, a_max))
     return diagnoser_of(plant, filter, decision_rule(plant, decision, threshold, release_after, position, structured))

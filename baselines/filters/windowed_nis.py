@@ -23,7 +23,7 @@ def chi_square_quantile(confidence: float, freedoms: int) -> float:
     return 2.0 * float(gammaincinv(0.5 * freedoms, confidence))
 
 
-def window_rule(m: int, window: int, limit: float, alarm_after: int) -> Rule:
+def window_rule(window: int, limit: float, alarm_after: int) -> Rule:
     """The sum of the last `window` NIS values against a limit; a sensor that is missing counts with its expectation."""
     after = Persistence(alarm_after, 1, 1)
 
@@ -76,4 +76,4 @@ def windowed_nis(plant: Plant, *, window: int = 50, confidence: float = 0.9999, 
         return Reading(x=s.x, Px=s.P, nu=s.nu, cost=nis[:, None], signals=shown)
 
     filter = Filter(start, lambda s, at: (kalman_filter.predict(f, s[0], at), s[1]), update, read, first_sample=False)
-    return diagnoser_of(plant, filter, window_rule(m, window, limit, alarm_after))
+    return diagnoser_of(plant, filter, window_rule(window, limit, alarm_after))

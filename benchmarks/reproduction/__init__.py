@@ -1,4 +1,6 @@
-"""Published and reference figures, measured again: one folder per plant, `python -m benchmarks.reproduction.<plant>`.
+"""Published figures, measured again: one folder per paper, `python -m benchmarks.reproduction.<plant>`.
 
-A folder holds the printed figures with their sources (`reference.toml`), what is measured, and the page.
+A folder holds what is printed, with its sources (`reference.toml`), what differs from the paper and why
+(`differences.toml`), its claims as tests (`claims.py`), what is measured, and the page. `python -m benchmarks.reproduction`
+writes the index over the papers.
 """

@@ -21,15 +21,31 @@ def shown(value: Figure, digits: int | None = None) -> str:
 
 
 class Comparisons:
-    """Cells "reference / found" with a star where the two differ, and the count of those that agree."""
+    """Cells "reference / found" with a star where the two differ, and the count of those that agree.
+
+    Figures of the same flights are not independent, so they are counted by the flights that they are of, too.
+    """
 
     def __init__(self) -> None:
         self.agree = self.total = 0
+        self.sets: dict[str, bool] = {}  # flights: whether all their figures agree
+        self._flights = "all"
+
+    def of(self, flights: str) -> None:
+        """The figures from here on are of these flights."""
+        self._flights = flights
 
     def count(self, same: bool) -> bool:
         """Count one comparison."""
         self.agree, self.total = self.agree + bool(same), self.total + 1
+        self.sets[self._flights] = self.sets.get(self._flights, True) and bool(same)
         return same
+
+    def summary(self) -> str:
+        """How many agree."""
+        sets = f"{sum(self.sets.values())} of {len(self.sets)} sets of flights agree in all their figures"
+        figures = f"{self.agree} of {self.total} figures"
+        return f"{sets}, {figures}; figures of one set are of the same flights and not independent."
 
     def cell(self, reference: Figure, found: Figure, digits: int = 3, error: float = 0.0) -> str:
         """They agree within three standard errors of their difference and its rounding, or where neither is there."""
@@ -64,3 +80,8 @@ def rms(x: Array, axis: Any = None) -> Any:
 def first(condition: Array) -> Array:
     """First sample (N,) at which each row (N, K) holds; NaN where none does."""
     return np.where(condition.any(axis=1), condition.argmax(axis=1), np.nan)
+
+
+def state_errors(estimate: Array, true: Array, window: slice) -> list[list[float]]:
+    """Root mean square error of each estimated state over a window: one row per flight (N, n_x) of (N, K + 1, n_x)."""
+    return rms((estimate - true)[:, window], axis=1).tolist()

@@ -1,4 +1,8 @@
-"""Measurements in named pieces, each kept in a file, so that a killed run goes on; and the command around them."""
+"""Measurements in named pieces, each kept in a file, so that a killed run goes on; and the command around them.
+
+What a page is made of lies beside it, `<plant>.pieces.gz`: JSON of all pieces by name, nine digits. A page is rendered from
+that file alone, so that anybody can do it; pieces that are measured anew take the place of what was there.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +17,10 @@ import msgspec
 import tyro
 from tqdm import tqdm
 
+from benchmarks.reproduction.claims import Found
 from fdi_gym.clusters import on, results
 from fdi_gym.commands.arguments import Backend, Cluster
-from fdi_gym.files import RefusedError, read_json, write_whole
+from fdi_gym.files import RefusedError, compress, decode, decompress, read_bytes, read_json, write_whole
 
 Jobs = dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]  # name: function and its arguments
 
@@ -57,6 +62,32 @@ def _one(file: Path, function: Callable[..., Any], arguments: tuple[Any, ...]) -
     write_whole(file, msgspec.json.encode(function(*arguments)))
 
 
+def kept(pages: Path, plant: str) -> Found:
+    """The pieces that lie beside a page.
+
+    Raises:
+        RefusedError: The file is damaged.
+    """
+    path = pages / f"{plant}.pieces.gz"
+    if not path.is_file():
+        return Found()
+    return Found(decode(decompress(read_bytes(path), str(path)), dict[str, Any], f"{path} holds no pieces"))
+
+
+def keep(pages: Path, plant: str, found: dict[str, Any]) -> None:
+    """Lay pieces beside a page."""
+    write_whole(pages / f"{plant}.pieces.gz", compress(msgspec.json.encode(found)))
+
+
+def rounded(value: Any) -> Any:
+    """A nest with its numbers rounded to nine digits."""
+    if isinstance(value, float):
+        return float(f"{value:.9g}")
+    if isinstance(value, dict):
+        return {key: rounded(part) for key, part in value.items()}
+    return [rounded(part) for part in value] if isinstance(value, list) else value
+
+
 @dataclasses.dataclass
 class Arguments:
     """What is measured, and where it goes."""
@@ -64,11 +95,13 @@ class Arguments:
     quick: bool = False
     """A small sample, to see that all works; its figures are not comparable, and its page stays with its pieces."""
     page_only: bool = False
-    """Measure nothing: the page of the pieces that are finished."""
+    """Measure nothing: the page of the pieces that are finished, and of those that lie beside the page."""
+    only: str = ""
+    """Measure only the pieces whose name begins like this."""
     work: Path = Path("runs/reproduction")
     """Folder of the finished pieces."""
     pages: Path = Path("leaderboards/reproduction")
-    """Folder of the page and its figures."""
+    """Folder of the page, its figures and its pieces."""
     workers: int = -1
     """Processes, or jobs of a cluster at a time; -1 for one per core."""
     backend: Backend = "loky"
@@ -77,25 +110,29 @@ class Arguments:
     """What the cluster is told, as name and value in turn; see docs/pages/clusters.md."""
 
 
-def command(
-    plant: str, plan: Callable[[bool], Jobs], write: Callable[[dict[str, Any], bool, Path], None], partial: bool = False
-) -> None:
+def command(plant: str, plan: Callable[[bool], Jobs], write: Callable[[Found, bool, Path], None]) -> None:
     """Measure what is missing and write the page: the command line of a plant's folder.
 
     Args:
         plant: Name of the folder.
         plan: The jobs, for a quick run or a whole one.
-        write: Writes the page and its figures from pieces, quick or not, to a path.
-        partial: The page can be made of a part of the pieces.
+        write: Writes the page and its figures from pieces, quick or not, to a path; a piece that is missing is named there.
     """
-    arguments = tyro.cli(Arguments, description=f"Reference figures of {plant}, measured again.")
+    arguments = tyro.cli(Arguments, description=f"Published figures of {plant}, measured again.")
     work = arguments.work / plant / ("quick" if arguments.quick else "full")
+    pages = work if arguments.quick else arguments.pages
     jobs = plan(arguments.quick)
-    with on(arguments.backend, arguments.cluster, arguments.work):
-        found = finished(work, jobs) if arguments.page_only else pieces(work, jobs, arguments.workers)
-    if len(found) < len(jobs) and not partial:
-        raise SystemExit(f"{len(jobs) - len(found)} of {len(jobs)} pieces are not finished in {work}: leave out --page-only")
-    page = (work if arguments.quick else arguments.pages) / f"{plant}.md"
-    page.parent.mkdir(parents=True, exist_ok=True)
-    write(found, arguments.quick, page)
-    print(page)
+    mine = {name: job for name, job in jobs.items() if name.startswith(arguments.only)}
+    if not mine:
+        raise SystemExit(f"no piece begins with {arguments.only!r}")
+    if not arguments.page_only:
+        with on(arguments.backend, arguments.cluster, arguments.work):
+            pieces(work, mine, arguments.workers)
+    before = kept(pages, plant)
+    found = Found({name: piece for name, piece in before.items() if name in jobs} | rounded(finished(work, jobs)))
+    if not found:
+        raise SystemExit(f"no piece is finished in {work}, and none lies in {pages}: leave out --page-only")
+    pages.mkdir(parents=True, exist_ok=True)
+    keep(pages, plant, {name: found[name] for name in jobs if name in found})
+    write(found, arguments.quick, pages / f"{plant}.md")
+    print(f"{pages / plant}.md, {len(found)} of {len(jobs)} pieces")

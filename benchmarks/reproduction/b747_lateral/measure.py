@@ -59,8 +59,8 @@ def sizes(quick: bool) -> Sizes:
     return Sizes(4, 2, 40, 20) if quick else Sizes(20, 20, 300, 150)
 
 
-def plan(quick: bool) -> Jobs:
-    """What the page needs."""
+def agreement_plan(quick: bool) -> Jobs:
+    """What the comparison with the second implementation needs."""
     n = sizes(quick)
     jobs: Jobs = {
         f"paper-{method}": (paper_piece, ("multisine", method, n.seeds)) for method in REFERENCE["scenario"]["rmse"]

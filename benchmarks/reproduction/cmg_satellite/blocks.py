@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.reproduction.cmg_satellite.outcomes import Said, hard_outcome, time_line_outcome, window_outcome
 from benchmarks.reproduction.numbered import fly
-from fdi_gym.diagnosis import make_diagnoser, run
+from fdi_gym.diagnosis import Diagnoser, make_diagnoser, run
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import Record
 from fdi_gym.faults import FaultScenario
@@ -29,7 +29,7 @@ CANDIDATES = {"CAUKF": 40, "GAUKF": 16, "SGAUKF": 4, "SGAUKF-odd": 4, "dual GAUK
 # what the oracle is told of the severities
 ALPHA = {"bench": (0.1, 0.9), "table5": (0.0, 1.0), "table4": (0.5, 0.9), "hard": (0.02, 0.4)}
 VARIANTS = ("bench", "table5", "table4", "hard", "severity")  # their places are part of the seeds
-PER_LABEL = {"bench": 5, "table5": 3, "severity": 2}  # episodes per fault label in a block
+PER_LABEL = {"bench": 5, "table5": 5, "severity": 2}  # episodes per fault label in a block
 SEVERITY_WINDOW = (1500, 4500)  # steps: from 15 s on, 30 s at one severity
 PER_BLOCK = {"hard": 30, "table4": 10}  # episodes in a block of those without labels
 
@@ -84,7 +84,11 @@ def _episode(b: Block, label: int, rng: np.random.Generator) -> FaultScenario:
 
 def show(plant: Plant, scenarios: list[FaultScenario], record: Record, method: str, **tuning: Any) -> Said:
     """Show a block to a method."""
-    diagnoser = make_diagnoser(METHODS[method], plant, scenarios=scenarios, **tuning)
+    return read(make_diagnoser(METHODS[method], plant, scenarios=scenarios, **tuning), record, method)
+
+
+def read(diagnoser: Diagnoser, record: Record, method: str) -> Said:
+    """What a diagnoser says of a block, and what that took."""
     n, samples, _ = record.obs.shape
     begun = time.process_time()
     said = run(diagnoser, record.obs, signals=True)
@@ -95,7 +99,7 @@ def show(plant: Plant, scenarios: list[FaultScenario], record: Record, method: s
     flag = signals["flag"] > 0 if "flag" in signals else np.zeros((n, samples), bool)
     adapted = signals["adapted"][:, -1].astype(np.int64) if "adapted" in signals else np.zeros(n, np.int64)
     filter_steps = samples - 1 + CANDIDATES.get(method.removesuffix(SIGMA_R), 0) * adapted
-    return Said(said.estimate, said.label.astype(np.int64), sd, flag, filter_steps, seconds)
+    return Said(said.estimate, said.label.astype(np.int64), sd, flag, filter_steps, seconds, adapted, said.state)
 
 
 def tuning_of(b: Block) -> dict[str, Any]:

@@ -26,6 +26,8 @@ class Said(NamedTuple):
     flag: Array  # (N, K + 1) fault flag or reset
     filter_steps: Array  # (N,) steps of the filter, candidates included
     seconds: float  # processor time of the filter, all episodes
+    adapted: Array  # (N,) steps in which the covariance was adapted
+    state: Array | None = None  # (N, K + 1, 11)
 
 
 def rmse(error: Array) -> float | None:
@@ -70,6 +72,14 @@ def window_outcome(record: Record, said: Said, i: int, a: int, b: int) -> dict[s
     }
 
 
+def state_errors(record: Record, said: Said, i: int) -> list[float] | None:
+    """RMSE of the attitude's vector part, the rate [rad/s] and the gimbal angles [rad] from 5 s on."""
+    if said.state is None:
+        return None
+    error = (said.state[i] - record.state[i])[500 : int(record.length[i]) + 1]
+    return [float(rms(error[:, part])) for part in (slice(0, 3), slice(4, 7), slice(7, 11))]
+
+
 def time_line_outcome(record: Record, said: Said, i: int) -> dict[str, Any]:
     """An episode of the source's Table 4: faults from 20 s to 150 s."""
     K = int(record.length[i])
@@ -78,7 +88,7 @@ def time_line_outcome(record: Record, said: Said, i: int) -> dict[str, Any]:
         "pre": rmse(error[500:onset]), "faulty": rmse(error[onset + 1 : end]), "post": rmse(error[end + 1 : K + 1]),
         "right": float((said.label[i, : K + 1] == record.label[i, : K + 1]).mean()),
         "flags": int(said.flag[i].sum()), "at_once": bool(said.flag[i, end + 1]), "sd": rmse(said.sd[i, onset + 1 : end]),
-        "steps": int(said.filter_steps[i]),
+        "steps": int(said.filter_steps[i]), "adapted": int(said.adapted[i]), "state": state_errors(record, said, i),
     }  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from baselines.filters.mekf import first_covariance
 from baselines.oracles.cramer_rao_oracle import Q_FLOOR, bound_step, opened
 from benchmarks.reproduction.cmg_satellite.blocks import SIGMA_R, Block, block_piece, scenarios_of, show
 from benchmarks.reproduction.cmg_satellite.outcomes import time_line_outcome
+from benchmarks.reproduction.cmg_satellite.paper import GRIDS, LEVELS, own_plan
 from benchmarks.reproduction.numbered import fly
 from benchmarks.reproduction.pieces import Jobs, reference
 from fdi_gym.discovery import load_plant
@@ -18,13 +19,11 @@ from fdi_gym.faults import FaultScenario
 from fdi_gym.plants import cmg_satellite as cmg
 
 REFERENCE = reference("cmg_satellite")
-LEVELS = (45, 55, 75)  # dB
-GRIDS = ("CAUKF", "GAUKF", "SGAUKF")  # the three filters that the source compares
 SEVERITIES = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.9)
 SEVERITY_METHODS = ("SGAUKF", "MEKF", "CLAIR", "oracle")
 # Table 4 at 75 dB, where the reference's one flight is far from our mean: how far single flights are apart
 SINGLE_FLIGHTS = (("slew", "GAUKF"), ("slew", "CAUKF"), ("regulate", "UKF"))
-TRACKED = ("SGAUKF", "MEKF", "CLAIR")
+CAMPAIGN = 20  # blocks of Table 5's ranges: 1,500 flights, 100 of each fault label, as the source has them
 AFTER = (100, 300, 1000, 3000)  # samples after the onset at which the bound is read
 BOUND_ONSETS = (4000, 10000)
 # other readings of the data sheet's regulation at 75 dB: options of the plant, process noise, tuning of the filter
@@ -38,31 +37,42 @@ TRIED: dict[str, tuple[dict[str, Any], float, dict[str, Any]]] = {
 
 
 def plan(quick: bool) -> Jobs:
-    """All pieces, the blocks first."""
+    """All pieces: the source's own, the time line that its tables are of, its campaign, and then the rest."""
     count = 2 if quick else 8
-    jobs: Jobs = {b.name(): (block_piece, (b,)) for b in blocks(quick)}
+    jobs = own_plan(quick) | {b.name(): (block_piece, (b,)) for b in blocks(quick)}
     for g, levels in REFERENCE["bound"].items():
         for s in levels:
             for onset in BOUND_ONSETS:
                 jobs[f"bound-{g}-{s}-{onset}"] = (bound_piece, (g, int(s), onset, count))
     jobs["bound-null"] = (bound_piece, ("regulate", 55, BOUND_ONSETS[0], count, "null"))
-    jobs |= {f"tried-{i}": (tried_piece, (name,)) for i, name in enumerate(TRIED)}
-    return jobs | {f"tracking-{g}": (tracking_piece, (g,)) for g in ("slew", "regulate")}
+    return jobs | {f"tried-{i}": (tried_piece, (name,)) for i, name in enumerate(TRIED)}
 
 
 def is_campaign(b: Block) -> bool:
-    """Whether a block belongs to the campaign of the three filters on "bench"."""
-    return b.variant == "bench" and b.method in GRIDS
+    """Whether a block belongs to the campaign at the source's size."""
+    return b.variant == "table5" and b.method in GRIDS and b.reference == "slew"
+
+
+def campaign_blocks(quick: bool) -> list[Block]:
+    """The source's campaign: 1,500 flights of Table 5's ranges for each filter and noise level, on the slew.
+
+    Its own case, regulating, where no filter sees anything, once for each. Block by block, so that the flights of all
+    filters and levels are as many at any time.
+    """
+    slew, regulate = (
+        [[Block("table5", g, s, m, b) for s in LEVELS for m in GRIDS] for b in range(1 if quick else n)]
+        for g, n in (("slew", CAMPAIGN), ("regulate", 1))
+    )
+    return [b for part in (*slew[:1], *regulate, *slew[1:]) for b in part]
 
 
 def blocks(quick: bool) -> list[Block]:
-    """The blocks of the page, the campaign of the source's three filters first; one of each kind for a quick run."""
+    """The blocks of the page, the source's campaign first; one of each kind for a quick run."""
 
     def several(n: int) -> range:
         return range(1 if quick else n)
 
     grids = [Block("bench", "slew", s, m, b) for s in LEVELS for m in GRIDS for b in several(4)]
-    table5 = [Block("table5", "slew", s, m) for s in LEVELS for m in GRIDS]
     slew = REFERENCE["table_4"]["slew"]
     table4 = [Block("table4", "slew", s, m) for s in LEVELS for m in slew]
     table4 += [Block("table4", "regulate", s, m) for s in (45, 75) for m in slew if m != "SGAUKF-odd"]
@@ -82,8 +92,7 @@ def blocks(quick: bool) -> list[Block]:
     ranges = [
         Block("table5", g, int(s), m) for g, levels in REFERENCE["table_5"].items() for s, row in levels.items() for m in row
     ]
-    ranges += [Block("table5", "slew", 45, m, b) for b in several(3) for m in GRIDS]
-    return list(dict.fromkeys(grids + table5 + table4 + hard + severity + bench + settings + ranges))
+    return list(dict.fromkeys(campaign_blocks(quick) + grids + table4 + hard + severity + bench + settings + ranges))
 
 
 def bound_piece(profile: str, snr: int, onset: int, count: int, excitation: str = "none") -> list[list[list[float]]]:
@@ -104,17 +113,6 @@ def bound_piece(profile: str, snr: int, onset: int, count: int, excitation: str 
             found.append(np.sqrt(np.linalg.eigvalsh(P[:, 6:, 6:])).tolist())
         if k == onset:
             P = opened(P, np.ones(count, bool))
-    return found
-
-
-def tracking_piece(profile: str, every: int = 20) -> dict[str, Any]:
-    """Estimates over the source's time line at 45 dB, one sample in `every`."""
-    plant = load_plant(cmg.ID, reference=profile, snr=45)
-    scenarios = scenarios_of(Block("table4", profile, 45, "SGAUKF"))[:1]
-    record = fly(plant, scenarios)
-    found: dict[str, Any] = {"truth": record.theta[0, ::every].tolist()}
-    for method in TRACKED:
-        found[method] = show(plant, scenarios, record, method).estimate[0, ::every].tolist()
     return found
 
 

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.reproduction.claims import Found, Missing, share
 from benchmarks.reproduction.cmg_satellite.blocks import Block
+from benchmarks.reproduction.cmg_satellite.paper import PARTS
 from benchmarks.reproduction.comparison import Comparisons, Figure, shown
 from fdi_gym.plant import Array
 from fdi_gym.plants import cmg_satellite as cmg
@@ -18,15 +20,39 @@ PHASES = ("pre", "faulty", "post")
 
 
 class Results:
-    """The outcomes of the blocks, looked up by setting, and their comparison with the reference."""
+    """The outcomes of the blocks that are measured, looked up by setting, and their comparison with the reference."""
 
     def __init__(self, blocks: dict[Block, dict[str, Any]]):
         self.blocks, self.t = blocks, Comparisons()
 
-    def outcomes(self, variant: str, reference: str, snr: int, method: str, level: float = 0.01) -> Outcomes:
-        """All episodes of one setting."""
+    def measured(self, variant: str, reference: str, snr: int, method: str, level: float = 0.01) -> Outcomes:
+        """All episodes of one setting; none where none is measured."""
         key = (variant, reference, snr, method)
         return [o for b, piece in self.blocks.items() if b[:4] == key and b.level == level for o in piece["outcomes"]]
+
+    def outcomes(self, variant: str, reference: str, snr: int, method: str, level: float = 0.01) -> Outcomes:
+        """All episodes of one setting.
+
+        Raises:
+            Missing: None is measured.
+        """
+        found = self.measured(variant, reference, snr, method, level)
+        if not found:
+            raise Missing(Block(variant, reference, snr, method, 0, level).name())
+        return found
+
+    def paired(self, variant: str, reference: str, snr: int, methods: Sequence[str]) -> list[Outcomes]:
+        """The episodes of one setting that all of these methods have been shown, in the same order.
+
+        Raises:
+            Missing: There is none.
+        """
+        numbers = [{b.number for b in self.blocks if b[:4] == (variant, reference, snr, m)} for m in methods]
+        both = sorted(set.intersection(*numbers))
+        if not both:
+            lacking = next(m for m, n in zip(methods, numbers, strict=True) if not n) if not all(numbers) else methods[0]
+            raise Missing(Block(variant, reference, snr, lacking).name())
+        return [[o for n in both for o in self.blocks[Block(variant, reference, snr, m, n)]["outcomes"]] for m in methods]
 
     def seconds(self, variant: str, reference: str, snr: int, method: str) -> float:
         """Processor time per 200 s of flight."""
@@ -61,6 +87,19 @@ class Results:
         return f"{self.t.cell(reference, given.mean(), 1, math.hypot(half / 1.96, error))} +- {1.96 * error:.1f}"
 
 
+def line(found: Found, profile: str, snr: int, methods: Sequence[str]) -> list[Outcomes]:
+    """The flights of Table 4 that all of these have been shown; "literal odd" and the like are readings of SGAUKF.
+
+    Raises:
+        Missing: There is none.
+    """
+    names = [m.replace(" ", "-", 1) if m.startswith("literal ") else f"line-{profile}-{snr}-{m}" for m in methods]
+    parts = [part for part in range(PARTS) if all(f"{name}-{part}" in found for name in names)]
+    if not parts:
+        raise Missing(next((f"{n}-0" for n in names if f"{n}-0" not in found), f"{names[0]}-0"))
+    return [[o for part in parts for o in found[f"{name}-{part}"]["outcomes"]] for name in names]
+
+
 def column(outcomes: Outcomes, name: str) -> list[Any]:
     """One entry of all outcomes."""
     return [o[name] for o in outcomes]
@@ -81,20 +120,12 @@ def right(outcomes: Outcomes) -> list[bool]:
     return [o["decided"] == o["truth"] for o in outcomes]
 
 
-def wilson(outcomes: Outcomes) -> tuple[float, float]:
-    """95 % Wilson interval of the accuracy in %."""
-    n, p, z = len(outcomes), float(np.mean(right(outcomes))), 1.96
-    centre, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    scale = 100 / (1 + z * z / n)
-    return scale * (centre - half), scale * (centre + half)
-
-
 def percent(outcomes: Outcomes) -> str:
     """Accuracy with its 95 % Wilson interval and the number of episodes."""
     if not outcomes:
         return "-"
-    low, high = wilson(outcomes)
-    return f"{100 * float(np.mean(right(outcomes))):.1f} [{low:.1f}, {high:.1f}], n = {len(outcomes)}"
+    p, low, high, n = share(sum(right(outcomes)), len(outcomes))
+    return f"{100 * p:.1f} [{100 * low:.1f}, {100 * high:.1f}], n = {n}"
 
 
 def spread(values: Sequence[Figure], digits: int) -> str:

@@ -22,14 +22,6 @@ from fdi_gym.tables import markdown
 TABLE_4 = REFERENCE["table_4"]
 
 
-def tables(r: Results, extra: dict[str, Any]) -> str:
-    """All of them."""
-    return "\n\n".join([
-        "## Table 4's time line", slew(r), wrong_noise(r), regulate(r), single_flights(r), tried(extra), bench(r), ranges(r),
-        hard(r), other_settings(r), bound(r, extra), null_motion(r, extra), bound_of_time_line(r), severity(r),
-    ])  # fmt: skip
-
-
 def slew(r: Results) -> str:
     """Table 4's time line with excitation."""
     rows = []
@@ -116,7 +108,7 @@ def bench(r: Results) -> str:
         rows.append(["oracle at T_off", s, str(len(o)), r.share(100, column(o, "right_at_end"), 30), "-",
                      f"sd {r.mean(sd, column(o, 'sd'), 30, 4)}", "-", "-", "-"])  # fmt: skip
     head = ["method", "dB", "n", "accuracy (%)", *PHASES, "false alarms", "no flag"]
-    return f'## "bench"\n\n30 episodes there.\n\n{markdown(head, rows)}'
+    return f'### "bench"\n\n30 episodes there.\n\n{markdown(head, rows)}'
 
 
 def ranges(r: Results) -> str:
@@ -135,7 +127,7 @@ def ranges(r: Results) -> str:
                 rows.append([*row, r.share(accuracy, right(o), n), *r.means(reference, o, n, 4),
                              r.share(flagged, column(o, "flagged"), n), r.mean(inside, shares, n, 1)])  # fmt: skip
     head = ["case", "method", "n", "accuracy (%)", *PHASES, "flagged (%)", "inside (%)"]
-    return f"## Table 5's ranges\n\n{markdown(head, rows)}"
+    return f"### Table 5's ranges\n\n{markdown(head, rows)}"
 
 
 def hard(r: Results) -> str:
@@ -151,7 +143,7 @@ def hard(r: Results) -> str:
             there = 30 if m == "dual GAUKF" else 60
             rows.append([*row, r.interval(wide, half, column(o, "wide")), r.mean(rmse, column(o, "rmse"), there, 3)])
     head = ["method", "n", "sample", "segment", "sample, threshold 0.08", "RMSE of f"]
-    return f'## "hard"\n\n45 dB, mismatch 1 %; accuracy in %, mean +- 95 %.\n\n{markdown(head, rows)}'
+    return f'### "hard"\n\n45 dB, mismatch 1 %; accuracy in %, mean +- 95 %.\n\n{markdown(head, rows)}'
 
 
 def other_settings(r: Results) -> str:
@@ -177,7 +169,7 @@ def bound(r: Results, extra: dict[str, Any]) -> str:
                 row.append(" ; ".join(r.mean(v, f[i].tolist(), 1, digits) for v, f in zip(pair, sd, strict=True)))
             rows.append(row)
     return (
-        "## The bound\n\nsd of f after a change in healthy flight that one is told of (prior 0.5), onset 40 s ; 100 s; one "
+        "### The bound\n\nsd of f after a change in healthy flight that one is told of (prior 0.5), onset 40 s ; 100 s; one "
         "noise realisation there, 8 here.\n\n" + markdown(["case", "1 s", "3 s", "10 s", "30 s"], rows)
     )
 
@@ -225,7 +217,7 @@ def severity(r: Results) -> str:
         told = reference["regulate"].get(f"{a:g}")
         rows.append([*row, r.share(told, severity_hits(r, "regulate", "oracle", a), 600) if told else "-"])
     return (
-        "## Severity\n\nAccuracy (%) on windows of 30 s, 45 dB, all 15 fault labels; the oracle knows the severity to "
+        "### Severity\n\nAccuracy (%) on windows of 30 s, 45 dB, all 15 fault labels; the oracle knows the severity to "
         "+-0.005.\n\n![accuracy against severity](cmg_severity.png)\n\n"
         + markdown(["alpha", *(f"{m}, slew" for m in SEVERITY_METHODS), "oracle, regulate"], rows)
     )

@@ -1,7 +1,7 @@
 """The command; see the package's docstring."""
 
-from benchmarks.reproduction.huav_hover.measure import plan
 from benchmarks.reproduction.huav_hover.page import write
+from benchmarks.reproduction.huav_hover.paper import plan
 from benchmarks.reproduction.pieces import command
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """The command; see the package's docstring."""
 
-from benchmarks.reproduction.missile_pitch.measure import plan
 from benchmarks.reproduction.missile_pitch.page import write
+from benchmarks.reproduction.missile_pitch.paper import plan
 from benchmarks.reproduction.pieces import command
 
 if __name__ == "__main__":

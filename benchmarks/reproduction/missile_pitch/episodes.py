@@ -11,7 +11,7 @@ import numpy as np
 
 from baselines.filters.generalised_observer_scheme import ALL, SEVERAL
 from benchmarks.reproduction.comparison import rms
-from benchmarks.reproduction.missile_pitch.claims import Claims, beside
+from benchmarks.reproduction.missile_pitch.agreement import Statements, beside
 from benchmarks.reproduction.missile_pitch.measure import DT, REFERENCE, STEPS, batches
 from fdi_gym.plant import Array
 from fdi_gym.plants import missile_pitch as missile
@@ -32,11 +32,11 @@ def joined(parts: Sequence[Found]) -> dict[str, Array]:
     return found
 
 
-def randomised(found: Found, claims: Claims, episodes: int, complete: bool) -> str:
+def randomised(found: Found, claims: Statements, episodes: int, complete: bool) -> str:
     """The 600 numbered episodes."""
     r = joined([found[f"randomised {b}"] for b in range(len(batches(episodes)))])
     n = r["label"].size
-    text = f"## Randomised environment, {n} numbered episodes\n\n"
+    text = f"### Randomised environment, {n} numbered episodes\n\n"
     text += "" if complete else "Quick run: the first episodes only, so counts cannot agree.\n\n"
     text += (
         accuracy(r, claims) + confusions(r, claims, complete) + two_classes(r) + delays(r) + exclusions(r) + magnitudes(r)
@@ -49,7 +49,7 @@ def randomised(found: Found, claims: Claims, episodes: int, complete: bool) -> s
     return text + f"none to jetloss: {', '.join(f'{v:.2f}' for v in error)} (reference 1.3 to 1.5, and 4.6 for a jam).\n"
 
 
-def accuracy(r: dict[str, Array], claims: Claims) -> str:
+def accuracy(r: dict[str, Array], claims: Statements) -> str:
     """Accuracy at the three times, early alarms."""
     truth, n = r["label"], r["label"].size
     faulty, groups = truth > 0, n // 30
@@ -85,7 +85,7 @@ def counted(truth: Array, said: Array, columns: Sequence[int]) -> list[list[int]
     return [[int(((truth == row) & (said == column)).sum()) for column in columns] for row in range(6)]
 
 
-def confusions(r: dict[str, Array], claims: Claims, complete: bool) -> str:
+def confusions(r: dict[str, Array], claims: Statements, complete: bool) -> str:
     """Confusion matrices at the end, also of the strict verdicts; a cell that differs from the reference shows both."""
     text = ""
 
@@ -159,7 +159,7 @@ def magnitudes(r: dict[str, Array]) -> str:
     return text + markdown(["true", "EKF of the true class", "matched estimator", "always zero"], rows) + "\n"
 
 
-def variants(found: Found, claims: Claims, episodes: int, complete: bool) -> str:
+def variants(found: Found, claims: Statements, episodes: int, complete: bool) -> str:
     """Noise and fault sizes scaled."""
     rows, same = [], True
     for reference in REFERENCE["variant"]:
@@ -175,7 +175,7 @@ def variants(found: Found, claims: Claims, episodes: int, complete: bool) -> str
         claims.same("accuracy of the scaled variants", "36 figures", same)
     head = ["noise", "size", *REFERENCE["accuracy"], "true class excluded"]
     return (
-        f"## Noise and fault sizes scaled, {episodes} numbered episodes each\n\n{markdown(head, rows)}\n\n"
+        f"### Noise and fault sizes scaled, {episodes} numbered episodes each\n\n{markdown(head, rows)}\n\n"
         "At T0 + 2 s, T0 + 4 s and the end. In the last row sizes of jetloss beyond 1 void the scheme's guarantee; the "
         "plant's own option clips them.\n"
     )

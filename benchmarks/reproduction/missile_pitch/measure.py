@@ -62,8 +62,8 @@ def batches(episodes: int) -> list[range]:
     return [range(b, b + size) for b in range(0, episodes, size)]
 
 
-def plan(quick: bool) -> Jobs:
-    """What the page needs."""
+def agreement_plan(quick: bool) -> Jobs:
+    """What the comparison with the data sheet's own implementation needs."""
     n = sizes(quick)
     jobs: Jobs = {"study": (study, ()), "fault-free": (fault_free, (n.runs,))}
     for case in REFERENCE["robustness"]:
