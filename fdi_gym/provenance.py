@@ -165,7 +165,8 @@ def _parents(name: str) -> Iterator[str]:
 
 
 def _is_library(file: Path) -> bool:
-    return any(file.is_relative_to(folder) for folder in _LIBRARIES)
+    installed = "site-packages" in file.parts or "dist-packages" in file.parts  # also another environment's, on the path
+    return installed or any(file.is_relative_to(folder) for folder in _LIBRARIES)
 
 
 def _file_of(name: str) -> Path | None:
@@ -180,7 +181,7 @@ def _file_of(name: str) -> Path | None:
         try:
             spec = importlib.util.find_spec(name)
             origin = spec.origin if spec else None
-        except (ImportError, ValueError, AttributeError):
+        except Exception:  # whatever a package does when it is imported
             origin = None
     return Path(origin).resolve() if origin and origin.endswith(".py") and Path(origin).is_file() else None
 

@@ -279,7 +279,12 @@ TEXTS = [
     (HEAD + "1\0,2,3,4\n", "zero byte"), (HEAD + "1" * 2_000_000, "1048576 characters or more"),
     (b"\xff\xfea\0,\0b\0\n\0", "not text"),
     ("time,current,speed,voltage\n" + "0,1,1,1\n" * 3, "at least two rows"),
-    (",".join(map(str, range(20_000))) + "\n1", "up to 10000"),
+    (",".join(map(str, range(20_000))) + "\n1", "up to 10000"), (",,,,\n,,,,\n", "has no columns"),
+    (HEAD + "2026-13-40 00:00:00,1,2,3\n" * 3, "there is no such date"), (HEAD + "0000-00-00 00:00,1,2,3\n", "no such date"),
+    (HEAD + "1_0,1,2,3\n0,1,2,3\n", "a number or a date, not '1_0'"),
+    (HEAD + "0,1,2,3\n0.01,1,2_0,3\n", "line 3: speed is a number, not '2_0'"),
+    (HEAD + "-1e308,1,2,3\n1e308,1,2,3\n", "at least two rows"),
+    (HEAD.strip() + ",label\n" + f"0,1,2,3,{'9' * 90_000}\n0.01,1,2,3,0\n", "^.{1,300}$"),
 ]  # fmt: skip
 
 
@@ -328,6 +333,19 @@ def test_parquet_that_is_none_or_holds_something_else_is_refused(motor, tmp_path
         observations(motor, path)
 
 
+def test_times_with_a_zone_are_those_of_utc(motor, tmp_path):
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    base = {name: np.arange(40.0) for name in ("current", "speed", "voltage")}
+    stamps = [1_774_746_000_000 + 10 * i for i in range(-20, 20)]  # ms: a summer time begins in their middle
+    for zone in (None, "UTC", "Europe/Berlin"):
+        pq.write_table(pa.table({**base, "time": pa.array(stamps, pa.timestamp("ms", zone))}), tmp_path / "flight.parquet")
+        found = observations(motor, tmp_path / "flight.parquet")
+        assert np.allclose(found.time, np.arange(40) / 100)
+        assert found.notes == ()
+
+
 def test_nothing_in_a_parquet_file_is_executed(motor, tmp_path):
     """The metadata of an extension type that older readers unpickle."""
     import pyarrow as pa
@@ -366,6 +384,7 @@ MAPPINGS = [
     ('{"channels": {"p": {"column": "x", "factor": 1e400}}}', "out of range|factor"),
     ('{"channels": {"p": {"factor": 2}}}', "missing required field `column`"),
     ('{"label": "a", "onset": "b"}', "not by both"),
+    ('{"channels": {"p": {"column": "x", "factor": 0}}}', "factor is not 0"),
     ("[" * 100_000, "Expected `object`"), ('{"not_recorded": [""]}', "length >= 1"),
 ]  # fmt: skip
 

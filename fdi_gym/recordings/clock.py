@@ -42,9 +42,13 @@ def seconds(values: Array, unit: str | None, what: str) -> tuple[Array, Array]:
         for date in text:
             if date and not _DATE.fullmatch(str(date).removesuffix("Z").removesuffix("+00:00")):
                 raise RefusedError(f"{what}: a date is as in '2026-03-09 10:14:33.25', not {str(date)[:80]!r}")
-        dates = [
-            np.datetime64(str(d).removesuffix("Z").removesuffix("+00:00"), "ns") if d else np.datetime64("NaT") for d in text
-        ]
+        try:
+            dates = [
+                np.datetime64(str(d).removesuffix("Z").removesuffix("+00:00"), "ns") if d else np.datetime64("NaT")
+                for d in text
+            ]
+        except ValueError as error:  # the thirteenth month
+            raise RefusedError(f"{what}: there is no such date: {error}") from None
         stamps = np.array(dates, "datetime64[ns]")
         there = ~np.isnat(stamps)
         found[there] = (stamps[there] - stamps[there][0]).astype(np.int64) * 1e-9
@@ -52,13 +56,16 @@ def seconds(values: Array, unit: str | None, what: str) -> tuple[Array, Array]:
     if not np.char.count(text, ".").any():
         text = np.char.replace(text, ",", ".")  # a decimal comma
     try:
+        if np.char.count(text, "_").any():  # a number to Python, to nobody else
+            raise ValueError
         numbers = np.where(text == "", "nan", text).astype(float)
     except ValueError:
         wrong = next(str(cell) for cell in filled if not _is_number(str(cell)))
         raise RefusedError(f"{what} is a number or a date, not {wrong[:80]!r}") from None
     numbers = np.where(np.isfinite(numbers), numbers, np.nan) * TIME[unit or "s"]
     there = np.isfinite(numbers)
-    return numbers - (numbers[there][0] if there.any() else 0.0), numbers
+    with np.errstate(over="ignore"):  # what is too far away for a number has no time
+        return numbers - (numbers[there][0] if there.any() else 0.0), numbers
 
 
 def _is_number(text: str) -> bool:
@@ -66,7 +73,7 @@ def _is_number(text: str) -> bool:
         float(text)
     except ValueError:
         return False
-    return True
+    return "_" not in text
 
 
 class Clock(NamedTuple):

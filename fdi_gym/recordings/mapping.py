@@ -66,6 +66,10 @@ class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     factor: Number | None = None
     offset: Number = 0.0
 
+    def __post_init__(self) -> None:
+        if self.factor == 0:
+            raise ValueError("a factor is not 0: nothing would be left of what was recorded")
+
 
 class Time(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The column with the time: numbers in a unit, or dates with times ("2026-03-09 10:14:33")."""

@@ -80,7 +80,7 @@ def observations(plant: Plant, source: Any, mapping: Mapping | None = None) -> R
     if mapping.onset is not None or mapping.label is not None or truth:
         label = _label(plant, table, mapping, values, at, t, stamps, time)
     if mapping.not_recorded:
-        notes.append(f"not recorded: {', '.join(mapping.not_recorded)}")
+        notes.append(f"not recorded: {', '.join(dict.fromkeys(mapping.not_recorded))}")
     return Recording(obs, np.round(at.samples - at.t[0], 9), label, (*notes, *at.notes))
 
 
@@ -110,7 +110,7 @@ def _columns(plant: Plant, table: Table, mapping: Mapping) -> dict[str, Column]:
     channels = channel_columns(plant)
     for name in (*mapping.channels, *mapping.not_recorded):
         if name not in channels:
-            raise RefusedError(unknown("channel", name, channels, plant.id))
+            raise RefusedError(unknown("channel", name[:80], channels, plant.id))
     found: dict[str, Column] = {}
     missing = []
     for name in channels:
@@ -149,8 +149,8 @@ def _scaled(table: Table, column: Column, wanted: str, values: dict[str, Array])
         factor = factor_between(unit, wanted)
         if factor is None:
             raise RefusedError(
-                f"{table.source}: {column.column} is in {unit!r}, the plant wants {wanted!r}, and nothing is known of how "
-                "one is made of the other: give a factor"
+                f"{table.source}: {column.column[:80]} is in {unit[:80]!r}, the plant wants {wanted!r}, and nothing is "
+                "known of how one is made of the other: give a factor"
             )
     raw = values[column.column]
     if raw.dtype.kind == "U":  # also the time, or a label
@@ -260,7 +260,7 @@ def _moment(
     unit = time.unit or (table.units[time.column] if table.units[time.column] in TIME else None) if time else None
     moment = clock.seconds(np.array(words), unit, f"{table.source}: {name}")[1][0]
     if not np.isfinite(moment):
-        raise RefusedError(f"{table.source}: {name} holds {words[0]!r}, which is no time")
+        raise RefusedError(f"{table.source}: {name} holds {str(words[0])[:80]!r}, which is no time")
     first = np.flatnonzero(np.isfinite(t))[0]
     return float(moment - stamps[first] + t[first])
 
@@ -281,4 +281,4 @@ def label_index(plant: Plant, word: str, names: dict[str, str], source: str) -> 
         number = np.nan
     if number in range(len(known)):
         return int(number)
-    raise RefusedError(f"{source}: {unknown('label', said, known, plant.id)}, or their numbers from 0")
+    raise RefusedError(f"{source}: {unknown('label', said[:80], known, plant.id)}, or their numbers from 0")

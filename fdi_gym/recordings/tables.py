@@ -6,6 +6,7 @@ refused in words. Parquet needs pyarrow, CSV nothing.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -160,7 +161,9 @@ def _text(path: Path, header: bool, separator: str | None) -> Table:
         raise RefusedError(f"{path} is empty")
     if separator is None:
         separator = max(SEPARATORS, key=first.count)
-    head = next(cells for _, cells in _cells(path, separator))
+    head = next((cells for _, cells in _cells(path, separator)), None)
+    if head is None:
+        raise RefusedError(f"{path} has no columns")
     if len(head) < 2 and header:
         raise RefusedError(
             f"{path} has one column, {head[0].strip()[:80]!r}: columns are separated by ',', ';', '|' or tabs"
@@ -205,14 +208,13 @@ def _texts(cells: Sequence[str]) -> Array:
 
 
 def _numbers(path: Path, name: str, cells: list[str], at: Sequence[int], separator: str) -> Array:
-    try:
-        return np.array(cells, dtype=str).astype(float) if cells else np.zeros(0)
-    except ValueError:
-        pass
+    with contextlib.suppress(ValueError):
+        if not any("_" in cell for cell in cells):  # a number to Python, to nobody else
+            return np.array(cells, dtype=str).astype(float) if cells else np.zeros(0)
     found = np.full(len(cells), np.nan)
     for i, cell in enumerate(cells):
         try:
-            found[i] = float(cell)
+            found[i] = float(cell.replace("_", "?"))
         except ValueError:
             if separator != "," and _COMMA.match(cell):  # "0,5", as where columns are separated by ";"
                 found[i] = float(cell.replace(",", "."))
@@ -269,11 +271,15 @@ def _column(source: str, name: str, values: Any, as_number: bool) -> Array:
         values = values.cast(kind)
     plain = pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind) or pa.types.is_null(kind)
     stamp = pa.types.is_timestamp(kind)
+    if stamp and kind.tz:
+        values = values.cast(pa.timestamp(kind.unit))  # in UTC
     if as_number and plain:
         return (
             values.cast(pa.int8() if pa.types.is_boolean(kind) else kind).cast(pa.float64()).to_numpy(zero_copy_only=False)
         )
-    if not as_number and (plain or stamp or pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+    if not as_number and (
+        plain or stamp or pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
+    ):
         if pa.types.is_floating(kind):
             return values.to_numpy(zero_copy_only=False).astype(str)
         return np.array(["" if v is None else v for v in values.cast(pa.string()).to_pylist()], dtype=str)
