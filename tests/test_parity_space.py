@@ -42,7 +42,7 @@ def test_without_noise_and_fault_it_is_zero_for_any_state_and_command(b747):
     x0 = 50.0 * np.random.default_rng(1).standard_normal((4, 4))
     u = commands(b747)
     assert last_size(b747, belief_of(b747), flown(b747, x0, u)).max() < 1e-18
-    theta = b747.nominal_theta + [0.0, 0.0, 3.0, 0.0]
+    theta = b747.nominal_theta + np.array([0.0, 0.0, 3.0, 0.0])
     assert last_size(b747, belief_of(b747), flown(b747, x0, u, theta=theta)).min() > 1e-3
 
 

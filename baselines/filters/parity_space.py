@@ -20,7 +20,7 @@ import numpy as np
 
 from baselines.filters.augmented_gaussian import Gaussian, gaussian_filter, reading_of
 from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser, diagnoser_of
-from fdi_gym.estimation.augmented import AugmentedModel, augmented
+from fdi_gym.estimation.augmented import augmented
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_labels
@@ -28,7 +28,7 @@ from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T, times
 from fdi_gym.estimation.labels import manifolds
 from fdi_gym.estimation.parity import projected, stacked
-from fdi_gym.estimation.signatures import Signatures, Sums, heard, linearised, nothing_said, secants, spoken_for
+from fdi_gym.estimation.signatures import Sums, heard, local, nothing_said, spoken_for
 from fdi_gym.plant import Array, Plant
 
 LEAST = 1e-6  # a typical fault that moves the residual by fewer standard deviations is not seen at all
@@ -51,22 +51,6 @@ class Window(NamedTuple):
     sums: Sums
 
 
-class Local(NamedTuple):
-    """The model about a path."""
-
-    model: AugmentedModel
-    low: Array  # (p,) magnitudes between which a fault's signature is taken
-    high: Array  # (p,)
-
-    def f(self, X: Array, at: Interval) -> Signatures:
-        """One sample later."""
-        return linearised(self.model, lambda points: self.model.f(points, at), X, self.low, self.high, self.model.rest)
-
-    def h(self, X: Array, at: Interval) -> Signatures:
-        """What the sensors read."""
-        return linearised(self.model, lambda points: self.model.h(points, at), X, self.low, self.high, slice(None))
-
-
 def residual(w: Window, R: Array, scale: Array) -> tuple[Array, Array]:
     """The parity residual of a full window, white (n, rows), and what a unit of each fault adds to it (n, rows, p)."""
     full = stacked(w.A, w.E, w.D, w.Q, w.C, w.H, R, w.seen)
@@ -87,7 +71,7 @@ def parity_filter(plant: Plant, belief: Belief, order: int, paces: Sequence[floa
         NotApplicableError: No parity relation of this order that the disturbances leave alone shows any fault.
     """
     model, bare = augmented(plant, belief), augmented(plant, belief, faults=False)
-    path, local = gaussian_filter(bare, "extended"), Local(model, *secants(plant, belief.z_size))
+    path, about = gaussian_filter(bare, "extended"), local(model, belief.z_size)
     n_x, m, p, q = len(plant.states), len(model.R), len(belief.z_size), len(belief.disturbances)
     s, keep = order, 1.0 - 1.0 / np.asarray(paces, float)
     scale = np.concatenate([model.scale[model.x], np.tile(model.scale[model.d], s)])
@@ -104,7 +88,7 @@ def parity_filter(plant: Plant, belief: Belief, order: int, paces: Sequence[floa
         )  # fmt: skip
 
     def predict(w: Window, at: Interval) -> Window:
-        rows, slot, f = np.arange(len(w.X)), (at.k - 1) % s, local.f(w.X, at)
+        rows, slot, f = np.arange(len(w.X)), (at.k - 1) % s, about.f(w.X, at)
         A, E, D, noise = w.A.copy(), w.E.copy(), w.D.copy(), w.Q.copy()
         A[rows, slot], E[rows, slot], D[rows, slot] = f.A[:, :n_x, :n_x], f.E[:, :n_x], f.A[:, :n_x, n_x:]
         noise[rows, slot] = at.noise(Q)
@@ -112,7 +96,7 @@ def parity_filter(plant: Plant, belief: Belief, order: int, paces: Sequence[floa
 
     def shown(w: Window, at: Interval, slot: Array, y: Array, seen: Array) -> Window:
         """With the sample in its slot."""
-        rows, h = np.arange(len(w.X)), local.h(w.X, at)
+        rows, h = np.arange(len(w.X)), about.h(w.X, at)
         C, H, e, there = w.C.copy(), w.H.copy(), w.e.copy(), w.seen.copy()
         C[rows, slot], H[rows, slot] = h.A[..., :n_x], h.E
         e[rows, slot], there[rows, slot] = np.where(seen, y - h.mean, 0.0), seen
@@ -147,14 +131,14 @@ def parity_filter(plant: Plant, belief: Belief, order: int, paces: Sequence[floa
     filter = Filter(start, predict, update, read, expect=lambda w, at: model.expect(w.healthy.X[:, model.x], at))
     if not (np.diagonal(_seen(plant, filter, order), axis1=1, axis2=2) * belief.z_size**2 > LEAST**2).any():
         raise NotApplicableError(
-            f"no parity relation of order {order} that the initial state and the unmeasured disturbances of {plant.id} leave "
-            "alone shows any fault"
+            f"no parity relation of order {order} that the initial state and the unmeasured disturbances of {plant.id} "
+            "leave alone shows any fault"
         )
     return filter
 
 
 def _seen(plant: Plant, filter: Filter, order: int) -> Array:
-    """Information about the faults (2, p, p) in one window from trim on, under commands of typical size and their opposites."""
+    """Information about the faults (2, p, p) in a window from trim on, under commands of typical size, both ways."""
     u = plant.trim_command + np.array([[1.0], [-1.0]]) * [s.scale for s in plant.commands]
     known = np.tile([s.nominal for s in plant.known], (2, 1))
     w, y, seen = filter.start(2), np.tile(plant.measure(0.0, plant.trim_state, u[0]), (2, 1)), np.ones(2, bool)

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi_gym.estimation.augmented import AugmentedModel
-from fdi_gym.estimation.kalman import T
+from fdi_gym.estimation.interval import Interval
+from fdi_gym.estimation.kalman import T, times
 from fdi_gym.estimation.labels import Manifolds, nearest_of
 from fdi_gym.plant import Array, Plant
 
@@ -58,6 +59,31 @@ def linearised(
     A = T((F[:, 1 : 1 + N] - F[:, 1 + N : 1 + 2 * N]) / (2 * step[:, None]))
     E = T((F[:, 1 + 2 * N : 1 + 2 * N + p] - F[:, 1 + 2 * N + p :]) / (high - low)[:, None])
     return Signatures(F[:, 0], A, E)
+
+
+class Local(NamedTuple):
+    """The model about a healthy path: one sample ahead, and at the sensors."""
+
+    model: AugmentedModel
+    low: Array  # (p,) magnitudes between which a fault's signature is taken
+    high: Array  # (p,)
+
+    def f(self, X: Array, at: Interval) -> Signatures:
+        """One sample after X (n, N), states and disturbances."""
+        return linearised(self.model, lambda points: self.model.f(points, at), X, self.low, self.high, self.model.rest)
+
+    def h(self, X: Array, at: Interval) -> Signatures:
+        """What the sensors read at X (n, N)."""
+        H, n = self.model.H, len(X)
+        if H is None:
+            return linearised(self.model, lambda points: self.model.h(points, at), X, self.low, self.high, slice(None))
+        A, E = H[:, self.model.rest], H[:, self.model.z]
+        return Signatures(times(A, X), np.tile(A, (n, 1, 1)), np.tile(E, (n, 1, 1)))
+
+
+def local(model: AugmentedModel, size: Array) -> Local:
+    """The model of a plant about a path; size (p,): of its typical faults."""
+    return Local(model, *secants(model.plant, size))
 
 
 class Sums(NamedTuple):
