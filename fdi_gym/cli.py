@@ -13,6 +13,7 @@ from fdi_gym.commands import methods, rows, suites
 COMMANDS: dict[str, Any] = {
     "evaluate": rows.evaluate, "verify": rows.verify, "leaderboard": rows.render, "list": suites.show,
     "freeze": suites.freeze, "fit": methods.fit, "train": methods.train,
+    "diagnosability": methods.diagnosability,
 }  # fmt: skip
 
 

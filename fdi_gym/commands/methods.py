@@ -1,4 +1,4 @@
-"""What methods know: fit, train."""
+"""What methods know, and what any could: fit, train, diagnosability."""
 
 from __future__ import annotations
 
@@ -72,3 +72,31 @@ def train(
             output.mkdir(parents=True, exist_ok=True)
             write_whole(output / f"{path.stem}{suffix}", path.with_suffix(suffix).read_bytes())
     print(path if output is None else output / path.name)
+
+
+def diagnosability(
+    plant: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PLANT")],
+    process: str = "standard",
+    flights: int = 12,
+    seconds: float | None = None,
+    picture: Path | None = None,
+) -> None:
+    """Say which faults of a plant can be told apart, at what size and after how long, whatever the method.
+
+    Args:
+        plant: Plant or environment id; "module:id" where the module registers it.
+        process: Fault process, of whose flights the commands and noises are.
+        flights: Healthy flights that it is averaged over.
+        seconds: How long after the onset. Default: a third of a flight.
+        picture: File (.png, .pdf, .svg) that gets a picture of it.
+    """
+    from fdi_gym.diagnosability import diagnosability as measure
+    from fdi_gym.discovery import load_plant
+    from fdi_gym.listing import find_plant
+
+    if picture is not None and picture.suffix not in (".png", ".pdf", ".svg"):
+        raise ValueError(f"a picture is a .png, .pdf or .svg file, not {picture.name}")
+    found = measure(load_plant(find_plant(plant)[1]), process, flights=flights, seconds=seconds)
+    print(found.text())
+    if picture is not None:
+        found.picture().savefig(picture)
