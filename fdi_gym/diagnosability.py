@@ -10,8 +10,9 @@ G(t) = sum of V' S^-1 V up to t, V the signature, is the Fisher information abou
 - the Cramer-Rao bound of a mode's magnitude m along its direction d, its onset known and nothing else at fault: the standard
   deviation 1 / sqrt(d' G d) that no unbiased estimate goes below.
 
-Both hold for a known onset and a linear model: methods that are told neither are slower. A fault that acts through a
-command (a loss of effectiveness) shows only as far as the flights command it.
+A fault is never told from a label that holds it (a second fault of size 0, where its reach has that): only the price of the
+second fault speaks against such a label. Both measures hold for a known onset and a linear model: methods that are told
+neither are slower. A fault that acts through a command (a loss of effectiveness) shows only as far as the flights command it.
 
 [1] D. Eriksson, E. Frisk, M. Krysander, Automatica 49(6), 2013, who take the samples of a window; the innovations of the
 filter are the same information with all samples before the onset known.
@@ -51,6 +52,7 @@ class Diagnosability(NamedTuple):
     plant: str
     process: str
     labels: tuple[str, ...]  # all; the first is "none"
+    faults: Array  # (labels,) how many simultaneous faults each has
     modes: tuple[str, ...]
     unit: tuple[str, ...]  # of each mode's magnitude
     seconds: Array  # (T,) since onset
@@ -66,9 +68,9 @@ class Diagnosability(NamedTuple):
     def confusions(self) -> Array:
         """What a method that weighs all labels would say of each fault (labels - 1, labels): shares, over time and sizes.
 
-        Each label counts by exp(-nats), and a faulty one must be better than health by NEEDED nats before it is declared.
+        Each label counts by exp(-nats), and must be better by NEEDED nats for each of its faults.
         """
-        cost = np.nan_to_num(self.divergence) + NEEDED * (np.arange(len(self.labels)) > 0)
+        cost = np.nan_to_num(self.divergence) + NEEDED * self.faults
         share = np.exp(cost.min(axis=-1, keepdims=True) - cost)
         share = (share / share.sum(axis=-1, keepdims=True)).mean(axis=2)
         return np.trapezoid(share, self.seconds, axis=0) / (self.seconds[-1] - self.seconds[0])
@@ -262,7 +264,9 @@ def diagnosability(
     with np.errstate(divide="ignore"):
         bound = np.median(1.0 / np.sqrt(np.maximum(power, 0.0)), axis=1)
     unit = tuple(plant.estimated[int(np.argmax(np.abs(mode.direction)))].unit for mode in plant.modes)
+    faults = np.array([len(label.modes) for label in plant.labels])
     return Diagnosability(
-        plant.env_id, process, tuple(label.name for label in plant.labels), plant.mode_names, unit, times * plant.dt,
+        plant.env_id, process, tuple(label.name for label in plant.labels), faults,
+        plant.mode_names, unit, times * plant.dt,
         found, bound,
     )  # fmt: skip
