@@ -12,7 +12,7 @@ G(t) = sum of V' S^-1 V up to t, V the signature, is the Fisher information abou
 
 A fault is never told from a label that holds it (a second fault of size 0, where its reach has that): only the price of the
 second fault speaks against such a label. Both measures hold for a known onset and a linear model: methods that are told
-neither are slower. A fault that acts through a command (a loss of effectiveness) shows only as far as the flights command it.
+neither are slower. A fault that acts through a command (a loss of effectiveness) shows only as far as flights command it.
 
 [1] D. Eriksson, E. Frisk, M. Krysander, Automatica 49(6), 2013, who take the samples of a window; the innovations of the
 filter are the same information with all samples before the onset known.

@@ -20,7 +20,8 @@ def fit(
 
     Args:
         plant: Plant or environment id; "module:id" where the module registers it.
-        diagnosers: Names; "all" for every one that takes any.
+        diagnosers: Names; "all" for every one that takes any. What the file holds of others stays where names are given, as
+            long as the plant's code is the one that it is of.
         jobs: Worker processes, -1 for one per core.
         output: Folder that gets PLANT.json. Default: `fits` in the package of the methods, whence they are read.
     """
@@ -37,6 +38,8 @@ def fit(
         raise ValueError(f"nothing to fit: {len(suites)} suites of {plant_id}, {len(entries)} methods that take a belief")
     for path, found in knowledge.fit_suites(entries, suites, jobs).items():
         place = path if output is None else output / path.name
+        if diagnosers != ("all",):
+            found = knowledge.merged(place, found)
         knowledge.write_fits(place, found)
         print(f"{len(found.beliefs)} beliefs and {len(found.calibrations)} calibrations in {place}")
 

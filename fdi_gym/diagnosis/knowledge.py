@@ -135,6 +135,19 @@ def write_fits(path: Path, fits: Fits) -> None:
     write_whole(path, msgspec.json.format(to_json(fits), indent=0) + b"\n")
 
 
+def merged(path: Path, found: Fits) -> Fits:
+    """What was found, and what a file holds of the same plant code beside it: other methods', settings' and processes'."""
+    try:
+        old = from_json(path.read_bytes(), Fits)
+    except (OSError, ValueError):
+        return found
+    if (old.plant, old.code) != (found.plant, found.code):
+        return found
+    return msgspec.structs.replace(
+        found, beliefs={**old.beliefs, **found.beliefs}, calibrations={**old.calibrations, **found.calibrations}
+    )
+
+
 class Task(NamedTuple):
     """One fit: a method on a plant, a fault process and its settings."""
 
