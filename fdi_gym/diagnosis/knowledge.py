@@ -175,7 +175,9 @@ def fit_suites(entries: Sequence[Entry], suites: Sequence[Any], jobs: int = -1) 
     made = joblib.Parallel(jobs)(joblib.delayed(_belief)(t.plant, t.process) for t in wanted.values())
     beliefs: dict[str, Belief | None] = dict(zip(wanted, made, strict=True))
     calls = [
-        joblib.delayed(_calibration)(t.entry.name, *t[1:], beliefs.get(belief_key(t.plant, t.process)))
+        joblib.delayed(_calibration)(
+            t.entry.name, *t[1:], beliefs[belief_key(t.plant, t.process)] if t.entry.takes("belief") else None
+        )
         for t in tasks.values() if t.entry.takes("calibration")
     ]  # fmt: skip
     found = dict(
