@@ -189,7 +189,7 @@ def bank_filter(plant: Plant, model: AugmentedModel, groups: Groups, dedicated: 
         nu = np.where(heard[:, None], own[:, None] - mean.reshape(n, b, m), 0.0)
         S = (H @ P @ T(H) + model.R).reshape(n, b, m, m)
         told, worst = instant(hears, members, dedicated, nu, S, heard)
-        new = heard.any(axis=1)
+        new: Array = np.asarray(heard.any(axis=1))
         which = np.zeros((n, b, len(plant.outputs)), bool)
         which[:, :, model.sensors] = hears & heard[:, None]
         done = model.update(
@@ -203,7 +203,7 @@ def bank_filter(plant: Plant, model: AugmentedModel, groups: Groups, dedicated: 
         gain = np.where(usable, gain, -NEVER)
         cost = np.zeros((len(gain), labels))
         cost[:, 1:] = -(s.T[:, 0] - margin).max(axis=1)[:, None]
-        sensors = groups.of_label >= 0
+        sensors = np.flatnonzero(groups.of_label >= 0)
         cost[:, sensors] = -gain[:, groups.of_label[sensors]]
         x = model.x
         signals = {"evidence": gain, "residuals unheard": s.worst}

@@ -5,13 +5,13 @@ Of all observers and post-filters, r = V (y - y^) with the gain L and the weight
     Y = A Y A' + Ed Ed' - L S L',    S = C Y C' + Fd Fd',    L = A Y C' S^-1,    V = S^-1/2,
 
 Ed and Fd what unknown inputs of unit size do to state and sensors, makes the response to them co-inner: their gain is 1 at
-every frequency and in every direction, and the ratio of the gain of any fault to that of the disturbances is the largest that
-a residual can have, at every frequency at once: H-/H-infinity, H-infinity/H-infinity and the rest. The unknown inputs here are
-the noises and model errors of the belief and the disturbances that nothing measures, by their sizes.
+every frequency and in every direction, and the ratio of the gain of any fault to that of the disturbances is the largest
+that a residual can have, at every frequency at once: H-/H-infinity, H-infinity/H-infinity and the rest. The unknown inputs
+here are the noises and model errors of the belief and the disturbances that nothing measures, by their sizes.
 
 The gain is that of the plant linearised at trim, steady; its model runs nonlinear. A gap in the measurements moves Y on by
-the same equation until it has settled again. Isolation is by the signature that a fault has in the residual: how it moves the
-observer's error is followed along the flight, and sums of what the residuals say forget at several paces.
+the same equation until it has settled again. Isolation is by the signature that a fault has in the residual: how it moves
+the observer's error is followed along the flight, and sums of what the residuals say forget at several paces.
 
 [1] S. X. Ding, Model-Based Fault Diagnosis Techniques, 2nd ed., 2013, chapter 7; S. X. Ding, T. Jeinsch, P. M. Frank,
 E. L. Ding, International Journal of Adaptive Control and Signal Processing 14(7), 2000.
