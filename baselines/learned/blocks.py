@@ -1,8 +1,8 @@
 """A stream of samples as blocks, for methods that look at the channels alone: means, and which of them are whole.
 
-A block is the mean of `stride` scaled samples. A channel that did not report in a part of a block has the mean of the rest;
-a block that lacks a channel, or in which a command was held for want of a report, is not whole, and a window of blocks says
-something only where all of them are.
+A block is the mean of `stride` scaled samples. A channel that did not report in a part of a block has the mean of the rest,
+one that did not report at all what it had before. Such a block is not whole, nor is one in which a command was held for want
+of a report: relations that hold to a fraction of the noise hold in whole blocks only.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ class Stream(NamedTuple):
     held: Array  # (n,) bool: a command or known signal did not report in it
     window: Array  # (n, length, n_obs) means of the last blocks, the newest first
     whole: Array  # (n,) whole blocks in a row
+    heard: Array  # (n,) bool: every channel reported in the last block
 
 
 def begin(plant: Plant, length: int, n: int) -> Stream:
     """Before the first sample."""
     width = len(plant.observed)
     zeros = np.zeros((n, width))
-    return Stream(zeros, zeros, np.zeros(n, bool), np.zeros((n, length, width)), np.zeros(n, np.int64))
+    return Stream(zeros, zeros, np.zeros(n, bool), np.zeros((n, length, width)), np.zeros(n, np.int64), np.zeros(n, bool))
 
 
 def add(plant: Plant, stride: int, s: Stream, at: Interval, y: Array, seen: Array) -> tuple[Stream, Array]:
@@ -44,10 +45,10 @@ def add(plant: Plant, stride: int, s: Stream, at: Interval, y: Array, seen: Arra
         return s._replace(total=total, count=count, held=held), ends
     mean = np.where(count > 0, total / np.maximum(count, 1), s.window[:, 0])
     window = np.where(ends[:, None, None], np.concatenate([mean[:, None], s.window[:, :-1]], axis=1), s.window)
-    good = (count > 0).all(axis=1) & ~held
+    good, heard = (count == stride).all(axis=1) & ~held, np.where(ends, (count > 0).all(axis=1), s.heard)
     whole = np.where(ends, np.where(good, s.whole + 1, 0), s.whole)
     again = ~ends[:, None]
-    return Stream(total * again, count * again, held & ~ends, window, whole), ends
+    return Stream(total * again, count * again, held & ~ends, window, whole, heard), ends
 
 
 def of_flights(plant: Plant, obs: Array, stride: int) -> Array:

@@ -171,6 +171,7 @@ class Watching(NamedTuple):
 
     stream: Stream
     log: Array  # (n, labels)
+    even: Array  # (n, labels) the same, were all labels equally frequent: what the decision weighs
 
 
 def classifier(
@@ -193,18 +194,20 @@ def classifier(
     index = card.processes.index(expected)
 
     def start(n: int) -> Watching:
-        return Watching(blocks.begin(plant, LENGTH, n), np.tile(prior, (n, 1)))
+        even = np.full((n, len(prior)), -np.log(len(prior)))
+        return Watching(blocks.begin(plant, LENGTH, n), np.tile(prior, (n, 1)), even)
 
     def update(s: Watching, at: Interval, y: Array, seen: Array) -> Watching:
         stream, ends = blocks.add(plant, stride, s.stream, at, y, seen)
-        new = ends & (stream.whole > 0)
+        new = ends & stream.heard
         if not new.any():
             return s._replace(stream=stream)
         features = with_process(featurise(stream.window), np.full(len(y), index), len(card.processes))
-        log = log_softmax(own.scale * score(features) + bias)
-        return Watching(stream, np.where(new[:, None], log, s.log))
+        logits = own.scale * score(features)
+        log, even = log_softmax(logits + bias), log_softmax(logits)
+        return Watching(stream, *(np.where(new[:, None], a, b) for a, b in ((log, s.log), (even, s.even))))
 
     def read(s: Watching) -> Reading:
-        return Reading(cost=-2.0 * np.maximum(s.log, np.log(LEAST)), probs=np.exp(s.log))
+        return Reading(cost=-2.0 * np.maximum(s.even, np.log(LEAST)), probs=np.exp(s.log))
 
     return diagnoser_of(plant, Filter(start, lambda s, at: s, update, read), by_labels(plant, calibration))
