@@ -127,7 +127,7 @@ def test_the_same_bytes_alone_and_in_company_and_another_seed_differs(b747):
     assert np.array_equal(said.label_probs[1], alone.label_probs[0])
 
 
-@pytest.mark.parametrize("settings", [{"particles": 0}, {"branch": 0}, {"seed": -1}])
+@pytest.mark.parametrize("settings", [{"particles": 0}, {"branch_s": 0}, {"branch_s": float("nan")}, {"seed": -1}])
 def test_bad_settings(b747, settings):
     with pytest.raises(ValueError, match="1 or more"):
         make_diagnoser("mode_switching_particles", b747, **settings)

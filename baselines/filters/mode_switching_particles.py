@@ -176,7 +176,7 @@ def particle_filter(b: Hypotheses, particles: int, branch: int, seed: int) -> Fi
 
 @diagnoser("mode_switching_particles", "Rao-Blackwellised particles over label histories, optimal resampling, for any plant")
 def mode_switching_particles(
-    plant: Plant, belief: Belief, calibration: Calibration, *, particles: int = 24, branch: int = 5, seed: int = 0
+    plant: Plant, belief: Belief, calibration: Calibration, *, particles: int = 24, branch_s: float = 0.5, seed: int = 0
 ) -> Diagnoser:
     """The particles with their decision.
 
@@ -185,13 +185,16 @@ def mode_switching_particles(
         belief: The magnitudes of its faults, how often labels change, model errors.
         calibration: When it alarms.
         particles: Label histories that are kept.
-        branch: Samples between those at which a label may change.
+        branch_s: Seconds between the samples at which a label may change; a sample's length at least.
         seed: Of the resampling.
 
     Raises:
         ValueError: A number out of range.
     """
-    if particles < 1 or branch < 1 or seed < 0:
-        raise ValueError(f"particles and branch are 1 or more, the seed 0 or more, not {particles}, {branch}, {seed}")
+    if particles < 1 or not 0 < branch_s < np.inf or seed < 0:
+        raise ValueError(
+            f"particles are 1 or more, branch_s above 0, the seed 0 or more, not {particles}, {branch_s}, {seed}"
+        )
+    branch = max(1, round(branch_s / plant.dt))
     filter = particle_filter(hypotheses(plant, belief), particles, branch, seed)
     return diagnoser_of(plant, filter, by_labels(plant, calibration))
