@@ -10,7 +10,7 @@ from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
 from fdi_gym.plant import Array, Plant
 
 
-@diagnoser("null", "Always healthy")
+@diagnoser("null", "Always healthy", reference=True, sensors=True)
 def null(plant: Plant) -> Diagnoser:
     """Says that there is no fault, whatever it sees."""
     theta = plant.healthy
@@ -24,7 +24,7 @@ def null(plant: Plant) -> Diagnoser:
     return Diagnoser(lambda n: (), update, gaps=True)
 
 
-@diagnoser("random", "A guess, uniform over the labels, at every sample")
+@diagnoser("random", "A guess, uniform over the labels, at every sample", reference=True, sensors=True)
 def random(plant: Plant) -> Diagnoser:
     """Guesses label and parameters uniformly, from a hash of the sample: the same in any batch and on any run."""
     low, high = (np.array([getattr(s, end) for s in plant.estimated], float) for end in ("low", "high"))

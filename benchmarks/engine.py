@@ -68,6 +68,18 @@ def amortised(envs, samples):
     return [1e-6 * samples * envs.num_envs / seconds for seconds in clock.read()]
 
 
+def stalls(envs, steps):
+    """Milliseconds of CPU of a step: the median, the longest, and the longest of those about the ends of flights."""
+    actions, spent, begins = np.zeros(envs.num_envs, int), [], []
+    for _ in range(steps):
+        clock = Clock()
+        _, _, terminated, truncated, _ = envs.step(actions)
+        spent.append(1e3 * clock.read()[0])
+        begins.append(bool((terminated | truncated).any()))
+    begins = np.array(begins) | np.roll(begins, 1)  # they begin in the step of the end, or in the next
+    return statistics.median(spent), max(spent), max(np.array(spent)[begins], default=0.0)
+
+
 def bridge(venv, steps):
     """Thousand agent steps per second of CPU through an SB3 environment."""
     actions = np.zeros(venv.num_envs, int)
@@ -172,6 +184,12 @@ def main():
     print(f"\n{'1,024 at once, M steps/s':32s} {'CPU':>7s} {'wall':>7s}   over a flight, or 2,500 steps of a longer one")
     for name, (cpu, wall) in rates.items():
         print(f"  {name:30s} {cpu:7.2f} {wall:7.2f}")
+    print(f"{'1,024 at once, CPU ms a step':32s} {'median':>7s} {'longest':>7s} {'at ends':>7s}")
+    for plant in (p for p in plants if length[p] <= 2500):
+        envs = gym.make_vec(ids[plant], num_envs=1024)
+        envs.reset(seed=0)
+        median, longest, ends = stalls(envs, length[plant] + 2)
+        print(f"  {plant:30s} {median:7.2f} {longest:7.0f} {ends:7.0f}")
     most = gym.make_vec(ids["B747Lateral"], num_envs=8192)
     most.reset(seed=0)
     cpu, wall = interleaved({"": lambda: amortised(most, 1200)}, 1)[""]

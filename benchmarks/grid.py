@@ -19,11 +19,11 @@ from fdi_gym.evaluation import applicable, evaluate
 from fdi_gym.files import pretty, read_json, write_whole
 from fdi_gym.leaderboard import read_rows
 from fdi_gym.row import Row, row_path, write_rows
-from fdi_gym.suite import Suite, load_suite
+from fdi_gym.suite import AnySuite, load_suite, suite_names
 from fdi_gym.tables import clairvoyant, markdown, plain
 
 KINDS = ("standard", "hard")
-# the filters of the paper that each plant was taken from
+# the filters of the paper that a plant was taken from, by suite family
 PAPER = {
     "b747": (
         "two_stage_kf",
@@ -53,11 +53,18 @@ conservative on flights that have none: that is the price of seeing them.
 """
 
 
+def families() -> tuple[str, ...]:
+    """The suite families that have all kinds, a paper's first."""
+    names = suite_names()
+    found = [name.removesuffix(f"-{KINDS[0]}") for name in names if name.endswith(f"-{KINDS[0]}")]
+    return tuple(dict.fromkeys([*PAPER, *(f for f in found if all(f"{f}-{kind}" in names for kind in KINDS))]))
+
+
 @dataclasses.dataclass
 class Arguments:
     """What is run."""
 
-    plants: tuple[str, ...] = tuple(PAPER)
+    plants: tuple[str, ...] = families()
     """Suite families."""
     page_only: bool = False
     """Run nothing: the page of the rows that are there."""
@@ -71,12 +78,12 @@ class Arguments:
     """The page; the figures of the consistency lie beside it in grid.json."""
 
 
-def consistency_piece(suite: Suite, name: str) -> dict[str, Any]:
+def consistency_piece(suite: AnySuite, name: str) -> dict[str, Any]:
     """NIS and NEES of one filter on one suite's plant and process."""
     return measure(suite.build(), suite.process, name)
 
 
-def reasons_of(suite: Suite) -> dict[str, str]:
+def reasons_of(suite: AnySuite) -> dict[str, str]:
     """Why the methods that cannot run on a suite's plant cannot, in the code's words."""
     return applicable(suite, suite.build(), list(diagnosers()))[1]
 
@@ -138,7 +145,7 @@ def winners(found: dict[str, dict[str, Row]]) -> str:
     body = []
     for suite, rows in found.items():
         honest = {n: accuracy(r) for n, r in rows.items() if not clairvoyant(r)}
-        paper = {n: honest[n] for n in PAPER[suite.split("-")[0]] if n in honest}
+        paper = {n: honest[n] for n in PAPER.get(suite.split("-")[0], ()) if n in honest}
         if not paper:
             continue
         oracle = max((accuracy(r)[0] for r in rows.values() if clairvoyant(r)), default=None)
@@ -185,7 +192,7 @@ def page(results: Path, figures: dict[str, Any]) -> str:
     """The whole page, from the rows and the figures beside them."""
     parts = [INTRODUCTION]
     for kind in KINDS:
-        found = {f"{family}-{kind}": rows_of(results, f"{family}-{kind}") for family in PAPER}
+        found = {f"{family}-{kind}": rows_of(results, f"{family}-{kind}") for family in families()}
         parts.append(f"## {kind}\n\n{table(found)}\n\n### Who wins\n\n{winners(found)}")
     if absent := missing(results, figures):
         parts.append("## Not run yet\n\n" + "\n".join(f"- {suite}: {', '.join(names)}" for suite, names in absent.items()))

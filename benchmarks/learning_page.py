@@ -14,6 +14,7 @@ from baselines.learned import weights
 from baselines.learned.weights import Card
 from fdi_gym.files import write_whole
 from fdi_gym.leaderboard import read_rows
+from fdi_gym.plots import panels
 from fdi_gym.row import Row
 from fdi_gym.suite import suite_names
 from fdi_gym.tables import clairvoyant, markdown
@@ -149,22 +150,20 @@ def budget_table(cards: list[Card]) -> str:
 
 def picture(card: Card, path: Path) -> None:
     """The learning curve: validated score over training time."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6, 3.4), layout="constrained")
+    figure = panels.new_figure(6, 3.4)
     axes = figure.subplots()
     minutes = [entry["seconds"] / 60 for entry in card.curve]
-    for name in card.curve[0]["accuracy"]:
+    handles = []
+    for i, name in enumerate(card.curve[0]["accuracy"]):
         values: list[Any] = [entry["accuracy"][name] for entry in card.curve]
-        axes.plot(
-            minutes, values if name.endswith("rmse") else [100 * v for v in values], label=name, marker=".", markersize=3
-        )
-    score = "balanced accuracy %" if card.task != "identification" else "scaled RMSE"
-    axes.set(xlabel="minutes of training, one core of a shared machine", ylabel=f"{score}, validation flights")
+        shown = values if name.endswith("rmse") else [100 * v for v in values]
+        handles.append(panels.drawn(axes, minutes, shown, i, label=name, marker=".", markersize=4))
+    score = "balanced accuracy [%]" if card.task != "identification" else "scaled RMSE"
+    axes.set(xlabel="training [min], one core of a shared machine", ylabel=f"{score}, validation flights")
     axes.set_title(f"{card.method}, {card.plant}", fontsize=10)
-    axes.legend(frameon=False)
+    panels.plain(axes)
+    panels.legend(figure, handles, ncol=2)
     axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=110)
 
 

@@ -29,5 +29,5 @@ if __name__ == "__main__":
     found = evaluate(suite, [NAME, "null"], work=folder / "runs", jobs=1, command=command)
     write_rows(folder, suite, found)
     print(table([f.row for f in found.values()], {name: f.made.microseconds for name, f in found.items()}))
-    episodes = verify(row_path(folder, suite.name, NAME), share=0.3, suite=str(file), trust=[NAME])
+    episodes = verify(row_path(folder, suite.name, NAME), share=0.3, suite=str(file), trust=[NAME]).episodes
     print(f"\nevery figure of {NAME} follows from its episodes; run again with the same outcomes: {episodes}")

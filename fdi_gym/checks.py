@@ -11,7 +11,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fdi_gym import shapes
-from fdi_gym.faults import Abrupt, Effect, FaultProcess, FaultScenario, Hold, Incipient, Intermittent, Samples, Square
+from fdi_gym.data_sheet import Kernels
+from fdi_gym.faults import (
+    Abrupt,
+    Effect,
+    FaultProcess,
+    FaultScenario,
+    Hold,
+    Incipient,
+    Intermittent,
+    Ramp,
+    Samples,
+    Sampling,
+    Square,
+)
 
 if TYPE_CHECKING:
     from fdi_gym.data_sheet import FaultMode, Signal
@@ -73,8 +86,9 @@ def _wrong(plant: Plant) -> Iterable[str]:
         yield f"dt is a positive number of seconds, not {plant.dt!r}"
     if not is_whole(plant.substeps) or plant.substeps < 0:
         yield f"substeps is a whole number from 0 on, not {plant.substeps!r}"
-    for role, kernel in plant.kernels._asdict().items():
-        if not hasattr(kernel, "py_func") and not (kernel is None and role in plant.kernels._field_defaults):
+    kernels = plant.kernels
+    for role, kernel in kernels._asdict().items() if kernels is not None else ():
+        if not hasattr(kernel, "py_func") and not (kernel is None and role in Kernels._field_defaults):
             yield f"the kernel {role!r} is a function marked @kernel, not {kernel!r}"
     for role in ("physical", "reference", "monitor"):
         if not callable(getattr(plant, role)):
@@ -166,7 +180,9 @@ def check_scenario(plant: Plant, scenario: FaultScenario) -> None:
                 f"faults[{i}]: no fault mode {fault.mode!r}; {plant.id} has {', '.join(sorted(plant.mode_names))}"
             )
         for effect in fault.effects:
-            _check_effect(plant, f"faults[{i}]", effect)
+            _check_effect(plant, f"faults[{i}]", effect, scenario.steps)
+    if isinstance(scenario.sampling, Sampling):
+        check_sampling(plant, scenario.sampling, scenario.steps)
     plant.label_changes(scenario)  # there is a label for each set of modes that are active at once
     for name in ("reference", "disturbance", "physical"):
         shape = getattr(plant.shapes, name)
@@ -185,13 +201,24 @@ def _check_state(plant: Plant, x0: Sequence[float]) -> None:
             raise ValueError(f"x0: {signal.name} begins within [{low:g}, {high:g}], not at {value:g}")
 
 
-def _check_effect(plant: Plant, where: str, effect: Effect) -> None:
+def check_sampling(plant: Plant, sampling: Sampling, steps: int) -> None:
+    """Raise ValueError where there is no such sensor, or one lags by more than the flight."""
+    names = [s.name for s in plant.outputs]
+    for field in ("periods", "delays"):
+        for name, value in getattr(sampling, field).items():
+            if name not in names:
+                raise ValueError(f"{field}: {unknown('sensor', name, names, plant.id)}")
+            if field == "delays" and value > steps:
+                raise ValueError(f"delays: the sensor {name} lags by at most the flight's {steps} samples, not {value}")
+
+
+def _check_effect(plant: Plant, where: str, effect: Effect, steps: int) -> None:
     entries = plant.theta_entries
     if effect.entry not in entries:
         raise ValueError(f"{where}: no theta entry {effect.entry!r}; {plant.id} has {', '.join(entries)}")
     entry = plant.theta[entries.index(effect.entry)]
     match effect:
-        case Abrupt(value=value) | Incipient(value=value) | Intermittent(value=value):
+        case Abrupt(value=value) | Incipient(value=value) | Ramp(value=value) | Intermittent(value=value):
             low = high = value
         case Square(value=value, other=other):
             low, high = min(value, other), max(value, other)
@@ -204,6 +231,8 @@ def _check_effect(plant: Plant, where: str, effect: Effect) -> None:
             low, high = command.low, command.high  # the entry may get any command
         case _:
             raise TypeError(f"{where}: an unknown effect {effect!r}")
+    if plant.bare is not None and entries.index(effect.entry) in plant.lags and high > steps:
+        raise ValueError(f"{where}: a sensor lags by at most the flight's {steps} samples, not {high:g}")
     if not entry.low <= low <= high <= entry.high:
         raise ValueError(
             f"{where}: theta's {entry.name} lies within [{entry.low:g}, {entry.high:g}], where {type(effect).__name__} "

@@ -8,21 +8,17 @@ from typing import Any
 
 import tyro
 
-from fdi_gym.commands import methods, rows, suites
+from fdi_gym.commands import methods, packages, pages, recordings, rows, suites
+from fdi_gym.names import in_a_line
 
 COMMANDS: dict[str, Any] = {
-    "evaluate": rows.evaluate, "verify": rows.verify, "leaderboard": rows.render, "list": suites.show,
-    "freeze": suites.freeze, "fit": methods.fit, "train": methods.train,
+    "evaluate": rows.evaluate, "verify": rows.verify,
+    "leaderboard": pages.leaderboard, "report": pages.report, "plot": pages.plot,
+    "list": suites.show, "freeze": suites.freeze, "fit": methods.fit, "train": methods.train,
     "diagnosability": methods.diagnosability,
+    "diagnose": recordings.diagnose, "collect": recordings.collect, "export": recordings.export,
+    "new": packages.new, "check": packages.check,
 }  # fmt: skip
-
-
-def _said(error: ValueError | OSError) -> str:
-    """An error in one line, after whose it is."""
-    text = str(error)
-    if isinstance(error, OSError) and error.strerror:
-        text = error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
-    return " ".join("".join([*(f"{note}: " for note in getattr(error, "__notes__", [])), text]).split())
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -45,7 +41,7 @@ def main(argv: list[str] | None = None) -> None:
         print("\nfdi-gym: interrupted; the same command goes on from what is finished", file=sys.stderr)
         raise SystemExit(130) from None
     except (ValueError, OSError) as error:
-        print(f"fdi-gym: {_said(error)}", file=sys.stderr)
+        print(f"fdi-gym: {in_a_line(error)}", file=sys.stderr)
         raise SystemExit(2) from None
 
 

@@ -1,9 +1,9 @@
 """The closed loop, sample by sample: THE order of operations in a step is written here and nowhere else.
 
-At sample k: the sensors give y_k; what else is known gives n_k; the controller computes u_k, held until k + 1; entries of
-theta that a hold fault owns take their value; the plant advances to x_{k+1} under the fault parameter that acts over
-[k, k + 1); process noise is added. The observation is [y_k, u_{k-1}, n_k]. u_{-1} is the trim command and theta at sample
-0 the nominal one: no interval has ended before sample 0.
+At sample k: the sensors give y_k, right or wrong; what else is known gives n_k; the controller computes u_k, held until
+k + 1; entries of theta that a hold fault owns take their value; the plant advances to x_{k+1} under the fault parameter
+that acts over [k, k + 1); process noise is added. The observation is [y_k, u_{k-1}, n_k]. u_{-1} is the trim command and
+theta at sample 0 the nominal one: no interval has ended before sample 0.
 """
 
 from __future__ import annotations
@@ -18,16 +18,20 @@ from numba.extending import intrinsic
 
 from fdi_gym.integration import interval
 from fdi_gym.kernels import M, V, compiled, control_at, known_at, map_at, outside_at, project_at
-from fdi_gym.noise import fill
+from fdi_gym.noise import fill, uniform
 
 TILE = 32  # samples of one flight flown before the next one's turn
 
 # Columns of a flight's table of effects: entry of theta, first and end step, kind, and what the kind needs
 ENTRY, ONSET, END, KIND, VALUE, FIRST, SECOND, COLUMNS = range(8)
-ABRUPT, INCIPIENT, INTERMITTENT, SQUARE, HOLD, SAMPLES = range(6)
+ABRUPT, INCIPIENT, INTERMITTENT, SQUARE, HOLD, SAMPLES, RAMP = range(7)
 
 # Columns of a sensor's faults at a sample; all 0: none
 GAIN, BIAS, NOISE, FROZEN, LAG, MISSING, FAULTS = range(7)
+
+# Columns of how a sensor reports: probability that a missing sample begins, and that another follows; samples from one
+# reading to the next; samples by which all of them lag; 1 where the last reading is shown again
+BEGIN, STAY, PERIOD, DELAY, AGAIN, REPORTING = range(6)
 
 # Where a flight is
 FLYING, ENDED, OVER, TERMINATED = range(4)  # ENDED: its last sample is still to be shown; TERMINATED: over, before its time
@@ -46,7 +50,9 @@ _at: Any = numba.carray  # type: ignore[attr-defined]  # the array there
 
 @numba.njit
 def _effects(k, seen, dt, table, count, values, held, nominal, a, b, g):
-    """theta over step k as a + b exp(-g tau), tau after sample k, from the effects that act then; of two, the later listed.
+    """theta over step k, tau after sample k, from the effects that act then; of two, the later listed.
+
+    It is a + b exp(-g tau), or a + b tau where g < 0.
 
     `seen`: as the sensors meet it at sample k, before the command of step k is known.
     Returns whether any entry drifts.
@@ -67,6 +73,12 @@ def _effects(k, seen, dt, table, count, values, held, nominal, a, b, g):
             a[j], g[j] = value, table[e, FIRST]
             b[j] = (nominal[j] - value) * np.exp(-g[j] * since)
             drifts = True
+        elif kind == RAMP:
+            share, then = min(since / table[e, FIRST], 1.0), min((since + dt) / table[e, FIRST], 1.0)
+            a[j] = nominal[j] + (value - nominal[j]) * share
+            if then > share:
+                b[j], g[j] = (value - nominal[j]) * (then - share) / dt, -1.0
+                drifts = True
         elif kind == INTERMITTENT:
             a[j] = value if (since / table[e, FIRST] + 1e-9) % 1.0 < table[e, SECOND] else nominal[j]
         elif kind == SQUARE:
@@ -83,30 +95,61 @@ def _effects(k, seen, dt, table, count, values, held, nominal, a, b, g):
 
 
 @numba.njit
-def _sense(k, y, z, row, sigma, limit, injected, v, sensors, s, slot, box, history, last, reading, shown):
-    """What the sensors say: `reading` (what the controller gets) and `shown` (NaN where a sensor does not report)."""
+def _wrong(k, tabled, sensors, s, slot, layered, theta, own, reports, reporting, seed, dropped, f):
+    """f (n_y, FAULTS): what is wrong with each sensor at sample k, from all who have a say."""
+    n_y = f.shape[0]
+    for i in range(n_y):
+        for c in range(FAULTS):
+            f[i, c] = sensors[s, slot, i, c] if tabled else 0.0
+            if layered:
+                f[i, c] += theta[own + c * n_y + i]
+        if reports:
+            f[i, LAG] += reporting[i, DELAY]
+            if reporting[i, PERIOD] > 1.0 and k % np.int64(reporting[i, PERIOD]):
+                f[i, MISSING] = 1.0
+            if reporting[i, BEGIN] > 0.0:
+                chance = reporting[i, STAY] if dropped[i] else reporting[i, BEGIN]
+                if k == 0:  # as long after a start
+                    chance = reporting[i, BEGIN] / (1.0 + reporting[i, BEGIN] - reporting[i, STAY])
+                dropped[i] = 1.0 if uniform(seed, k, i) < chance else 0.0
+                f[i, MISSING] += dropped[i]
+
+
+@numba.njit(inline="always")
+def _sense(
+    k, y, z, row, sigma, limit, injected, v, faulty, f, again, true_feedback, healthy, box, history, last, shown, fed
+):
+    """What the sensors say: `shown` (NaN where one does not report), and `fed`, what the controller gets.
+
+    `last` has the last reading of each, and what it last fed; `again`: it is shown in place of NaN. `true_feedback`: the
+    controller gets no noise. `healthy`: no faults.
+    """
     for i in range(y.size):
         true = y[i]
         if history.shape[0]:
             history[k % history.shape[0], i] = true
         noise = v[k, i] if injected else sigma[i] * min(max(z[row, i], -limit), limit) if sigma[i] else 0.0
+        clean = true if true_feedback else min(max(true + noise, box[0, i]), box[1, i])
         missing = frozen = False
-        if sensors.shape[0]:
-            lag = np.int64(sensors[s, slot, i, LAG])
-            if lag:
+        if faulty:
+            lag = min(np.int64(f[i, LAG]), history.shape[0] - 1)
+            if lag > 0:
                 true = history[max(k - lag, 0) % history.shape[0], i]
-            if sensors[s, slot, i, GAIN]:
-                true += sensors[s, slot, i, GAIN] * true
-            if sensors[s, slot, i, BIAS]:
-                true += sensors[s, slot, i, BIAS]
-            if sensors[s, slot, i, NOISE]:
-                noise += sensors[s, slot, i, NOISE] * noise
-            frozen, missing = sensors[s, slot, i, FROZEN] != 0.0, sensors[s, slot, i, MISSING] != 0.0
+            if f[i, NOISE]:
+                noise += f[i, NOISE] * noise
+            if f[i, GAIN]:
+                true += f[i, GAIN] * true
+                noise += f[i, GAIN] * noise
+            if f[i, BIAS]:
+                true += f[i, BIAS]
+            frozen, missing = f[i, FROZEN] != 0.0, f[i, MISSING] != 0.0
         says = min(max(true + noise, box[0, i]), box[1, i])
+        feeds = true if true_feedback else says
         if (frozen or missing) and k:
-            says = last[i]
-        last[i] = reading[i] = says
-        shown[i] = np.nan if missing else says
+            says, feeds = last[0, i], last[1, i]
+        last[0, i], last[1, i] = says, feeds
+        shown[i] = np.nan if missing and not again else says
+        fed[i] = clean if healthy else feeds
 
 
 _I, _D3 = int64[::1], float64[:, :, ::1]
@@ -117,7 +160,7 @@ _I, _D3 = int64[::1], float64[:, :, ::1]
         int64, int64, int64, int64, int64, int64,
         float64, int64, int64, V, V, M, M, V, float64, _I,
         uint64[::1], _I, _I, _I, _I, _I, _I, _I, M, _D3, _I, int64[:, ::1], int64[:, :, ::1],
-        _I, _I, M, M, M, M, M, M, _D3,
+        _D3, _I, _I, M, M, M, M, M, _D3, _D3, M,
         _I, int64, int64, _D3, float64[:, :, :, ::1], _D3, _D3, _D3, int64[:, ::1],
     )
 )  # fmt: skip
@@ -126,24 +169,27 @@ def fly(
     dt, substeps, true_feedback, nominal, q, sensor_box, command_box, sigma, limit, widths,
     seed, steps, reference_at, disturbance_at, process_noise, sensor_noise, reference_step, disturbance_step,
     p, effects, counts, values, labels,
-    at, status, X, C, U, THETA, held, readings, histories,
+    reporting, at, status, X, C, U, THETA, held, readings, histories, dropped,
     slots, first, samples, inputs, sensors, obs, state, theta, label,
 ):  # fmt: skip
     """Fly the flights in `slots` on by so many samples, into the rows from `first` on of obs, state, theta and label.
 
     The second line of arguments is the plant's, the next two the flights' (one row each; tables by address, with a step of
-    0 where one row serves all samples; a noise address of 0: by counter), then where they are, changed in place. `inputs`
-    (samples, flights, n_u) is added to the command within its range, `sensors` (samples, flights, n_y, FAULTS) is what is
-    wrong with the sensors; either may be empty.
+    0 where one row serves all samples; a noise address of 0: by counter), then how their sensors report (nothing: at every
+    sample) and where they are, changed in place. `inputs` (samples, flights, n_u) is added to the command within its range,
+    `sensors` (samples, flights, n_y, FAULTS) is what is wrong with the sensors; either may be empty. Of theta the plant's
+    equations get the first `widths[2]` entries; where there are more, they are the faults of its sensors, column by column.
     """
     dynamics, output, control = map_at(dynamics_address), map_at(output_address), control_at(control_address)
     known, project, outside = known_at(known_address), project_at(project_address), outside_at(outside_address)
     n, n_u, n_c, n_y, n_theta = X.shape[1], U.shape[1], C.shape[1], sensor_box.shape[1], nominal.size
     n_k = obs.shape[2] - n_y - n_u
-    n_r, n_d = widths[0], widths[1]
+    n_r, n_d, own, healthy = widths[0], widths[1], widths[2], widths[3] != 0
+    layered, tabled, reports = own < n_theta, sensors.shape[0] > 0, reporting.shape[0] > 0
     x, u, c, p_i, acts = np.empty(n), np.empty(n_u), np.empty(n_c), np.empty(p.shape[1]), np.empty(n_theta)
-    y, reading, shown, fed, out = np.empty(n_y), np.empty(n_y), np.empty(n_y), np.empty(n_y), np.empty(n_k)
+    y, shown, fed, out, wrong = np.empty(n_y), np.empty(n_y), np.empty(n_y), np.empty(n_k), np.zeros((n_y, FAULTS))
     a, b, g, theta_k = np.empty(n_theta), np.empty(n_theta), np.empty(n_theta), np.empty(n_theta)
+    theta_p, a_p, b_p, g_p, acts_p = theta_k[:own], a[:own], b[:own], g[:own], acts[:own]  # the plant's own
     r, d = np.empty(n_r), np.empty(n_d)
     k1, k2, k3, k4, z, before = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     used, words, normals = sigma > 0.0, np.empty((2, TILE), np.uint64), np.zeros((TILE, sigma.size))
@@ -173,6 +219,8 @@ def fly(
             v = _at(_pointer(sensor_noise[slot]), (last + 1, n_y), float64)
             acting, count, values_i, held_i = effects[slot], counts[slot], values[slot], held[slot]
             readings_i, history, segment = readings[slot], histories[slot], 0
+            again = reports and reporting[slot, 0, AGAIN] != 0.0
+            faulty = tabled or reports or (layered and count > 0)
             holds = False
             for e in range(count):
                 holds = holds or acting[e, KIND] == HOLD
@@ -187,17 +235,17 @@ def fly(
                 if count:
                     drifts = _effects(k, True, dt, acting, count, values_i, held_i, nominal, a, b, g)
                 for j in range(n_theta):
-                    theta_k[j] = a[j] + b[j]
-                output(t, x, u, theta_k, d, p_i, y)
-                for i in range(n_y):
-                    fed[i] = y[i]
+                    theta_k[j] = a[j] if g[j] < 0.0 else a[j] + b[j]
+                output(t, x, u, theta_p, d, p_i, y)
+                if faulty:
+                    _wrong(
+                        k, tabled, sensors, s, slot, layered, theta_k, own, reports, reporting[slot] if reports else wrong,
+                        seed[slot], dropped[slot] if reports else y, wrong,
+                    )  # fmt: skip
                 _sense(
-                    k, y, normals, s - tile, sigma, limit, injected, v, sensors, s, slot, sensor_box, history, readings_i,
-                    reading, shown,
+                    k, y, normals, s - tile, sigma, limit, injected, v, faulty, wrong, again, true_feedback != 0, healthy,
+                    sensor_box, history, readings_i, shown, fed,
                 )  # fmt: skip
-                if not true_feedback:
-                    for i in range(n_y):
-                        fed[i] = reading[i]
                 known(t, r, c, out)
                 while labels[slot, segment + 1, 0] <= k:
                     segment += 1
@@ -229,7 +277,9 @@ def fly(
                     drifts = _effects(k, False, dt, acting, count, values_i, held_i, nominal, a, b, g)
                 for i in range(n):
                     before[i] = x[i]
-                interval(dynamics, project, t, dt, substeps, x, u, drifts, a, b, g, d, p_i, acts, k1, k2, k3, k4, z)
+                interval(dynamics, project, t, dt, substeps, x, u, drifts, a_p, b_p, g_p, d, p_i, acts_p, k1, k2, k3, k4, z)
+                for j in range(own, n_theta):
+                    acts[j] = a[j] + (b[j] * (dt if g[j] < 0.0 else np.exp(-g[j] * dt)) if b[j] else 0.0)
                 lost = False
                 for i in range(n):
                     if injected:

@@ -79,9 +79,12 @@ def _members(plant: Plant) -> list[Array]:
 
 
 def true_rows(plant: Plant, label: Array, target: Array) -> Array:
-    """What was true of one flight (modes, 4), from its labels (K + 1,) and estimated quantity (K + 1, n)."""
+    """What was true of one flight (modes, 4), from its labels (K + 1,) and estimated quantity (K + 1, n), NaN if unknown."""
     found = {i: stretches(np.isin(label, labels)) for i, labels in enumerate(_members(plant))}
-    return _windows_to_rows(plant, {i: windows for i, windows in found.items() if windows}, label, target)
+    rows = _windows_to_rows(plant, {i: windows for i, windows in found.items() if windows}, label, target)
+    if np.isnan(target).all():  # a recorded flight: which faults it had is known, how large they were is not
+        rows[rows[:, PRESENT] > 0, SIZE] = np.nan
+    return rows
 
 
 def true_declaration(plant: Plant, record: Record) -> Array:
@@ -156,6 +159,7 @@ def errors(plant: Plant, truth: Array, declaration: Array) -> Errors:
     span = spans(plant)
     right = np.maximum(1.0 - np.abs(error) / np.where(span > 0, span, 1.0), 0.0)
     parts = np.stack([np.ones_like(right), overlap, right]).mean(axis=0)
+    parts = np.where(np.isnan(truth[..., SIZE]), 0.5 * (1.0 + overlap), parts)
     mean = np.where(is_there, np.nan_to_num(parts), 0.0).sum(axis=-1) / np.maximum(is_there.sum(axis=-1), 1)
     value = np.where(exact, np.where(is_there.any(axis=-1), mean, 1.0), 0.0)
     return Errors(exact, np.where(both, b[..., 0] - a[..., 0], np.nan), overlap, error, value)
@@ -165,6 +169,6 @@ def worth(plant: Plant, truth: Array, declaration: Array) -> Array:
     """The reward of declarations (n,), 0 to 1: 0 for a wrong set of modes, 1 for a healthy flight that is called healthy.
 
     Else the mean of 1, the overlap of the windows, and 1 less the error of the size as a share of its mode's reach (not
-    below 0), over the modes.
+    below 0; left out where the true size is not known), over the modes.
     """
     return errors(plant, truth, declaration).worth

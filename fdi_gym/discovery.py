@@ -1,20 +1,26 @@
-"""How plants are found: a file in `fdi_gym/plants/` with an `ID` line, or whatever `fdi_gym.register_plant` made known.
+"""How plants are found: a file in `fdi_gym/plants/` with an `ID` line, an entry point of the group "fdi_gym.plants" (its
+name is the environment's, its value the builder's "module:function"), or whatever `fdi_gym.register_plant` made known.
 
 Nothing is listed, and nothing is imported to list them. `load_plant` builds one by its id.
 """
 
 from __future__ import annotations
 
+import functools
 import importlib
 import inspect
 import re
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from fdi_gym.checks import is_whole, unknown
+from fdi_gym.names import find_module
+from fdi_gym.options import split_options
 from fdi_gym.plant import Plant
 
 _FOLDER = Path(__file__).parent / "plants"
+_BUILDER = re.compile(r"\w+(\.\w+)*:\w+")
 
 
 class PlantSource(NamedTuple):
@@ -50,9 +56,20 @@ def _package_sources() -> dict[str, PlantSource]:
     return found
 
 
+@functools.cache
+def _entry_point_sources() -> dict[str, PlantSource]:
+    """Plants of other packages: entry points such as DCMotor-Faults-v0 = "dc_motor:plant"; others are left aside."""
+    found = {}
+    for entry_point in entry_points(group="fdi_gym.plants"):
+        name = re.fullmatch(r"(\w+)-Faults-v(\d+)", entry_point.name)
+        if name and _BUILDER.fullmatch(entry_point.value) and name[1] not in _package_sources():
+            found[name[1]] = PlantSource(entry_point.value, int(name[2]))
+    return found
+
+
 def plant_sources() -> dict[str, PlantSource]:
     """All plants by id, read from the ID and VERSION lines of the plant files: nothing is imported to list them."""
-    return dict(sorted((_package_sources() | _registered).items()))
+    return dict(sorted((_package_sources() | _entry_point_sources() | _registered).items()))
 
 
 def add_plant_source(plant_id: str, source: PlantSource) -> None:
@@ -65,7 +82,7 @@ def add_plant_source(plant_id: str, source: PlantSource) -> None:
         raise ValueError(f"a plant's id is a word of letters, digits and underscores, not {plant_id!r}")
     if not is_whole(source.version) or source.version < 0:
         raise ValueError(f"{plant_id}: version is a whole number from 0 on, not {source.version!r}")
-    if not isinstance(source.builder, str) or not re.fullmatch(r"\w+(\.\w+)*:\w+", source.builder):
+    if not isinstance(source.builder, str) or not _BUILDER.fullmatch(source.builder):
         raise ValueError(f"{plant_id}: the builder is named as 'module:function', not {source.builder!r}")
     if plant_id in _package_sources():
         raise ValueError(f"{plant_id} is a plant of this package; another one needs another id")
@@ -73,12 +90,17 @@ def add_plant_source(plant_id: str, source: PlantSource) -> None:
 
 
 def load_plant(plant_id: str, **options: Any) -> Plant:
-    """Build a plant by id with the options of its data sheet.
+    """Build a plant by id; "module:id" where importing the module registers it.
+
+    It takes the options of its data sheet, and those of every plant (`fdi_gym.options`).
 
     Raises:
         ValueError: Unknown plant, option or option value (the message lists those that exist), or a builder that does
             not build the plant it is registered for.
     """
+    if isinstance(plant_id, str) and ":" in plant_id:
+        module, _, plant_id = plant_id.rpartition(":")
+        find_module(module)
     sources = plant_sources()
     if not isinstance(plant_id, str) or plant_id not in sources:
         raise ValueError(unknown("plant", plant_id, sources))
@@ -93,13 +115,17 @@ def _built(plant_id: str, source: PlantSource, options: dict[str, Any]) -> Plant
     except Exception as error:
         what = f"{type(error).__name__}: {error}"
         raise ValueError(f"{plant_id}: its builder {source.builder!r} cannot be imported: {what}") from error
+    try:
+        own, layers = split_options(options)
+    except ValueError as error:
+        raise ValueError(f"{plant_id}: {error}") from None
     named = [n for n, p in parameters.items() if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
     if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
-        for option in options:
+        for option in own:
             if option not in named:
-                raise ValueError(unknown("option", option, named, plant_id))
+                raise ValueError(unknown("option", option, [*named, *layers.__struct_fields__], plant_id))
     try:
-        plant = build(**options)
+        plant = build(**own)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{plant_id} with the options {options}: {error}") from error
     except Exception as error:
@@ -108,6 +134,10 @@ def _built(plant_id: str, source: PlantSource, options: dict[str, Any]) -> Plant
     if not isinstance(plant, Plant) or (plant.id, plant.version) != (plant_id, source.version):
         made = f"the plant {plant.env_id}" if isinstance(plant, Plant) else repr(plant)
         raise ValueError(f"{source.builder!r} is registered for {plant_id}-Faults-v{source.version}, but returns {made}")
+    try:
+        plant = layers.applied(plant)
+    except ValueError as error:
+        raise ValueError(f"{plant_id} with the options {options}: {error}") from error
     defaults = {n: parameters[n].default for n in named}
     object.__setattr__(plant, "_origin", Origin(plant_id, source, {**defaults, **options}))
     return plant

@@ -45,7 +45,7 @@ class FDIEnv(Specified, gym.Env):
 
     Args:
         plant: Plant id (set by the registration).
-        task: "isolation", "identification", "diagnosis" or "scenario".
+        task: "isolation", "modes", "identification", "diagnosis" or "scenario".
         process: Name of one of the plant's fault processes. Default: "standard".
         scenario: A `FaultScenario`, or its JSON text, that every episode replays exactly, noise included.
         mismatch: Level of the difference between the truth's physical parameters and the diagnosers' model, in the

@@ -19,16 +19,17 @@ import msgspec
 from tqdm import tqdm
 
 import fdi_gym
+from fdi_gym.compilation import compile_kernels
 from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, make_diagnoser, run
-from fdi_gym.engine import Record, simulate
+from fdi_gym.engine import Record
 from fdi_gym.files import RefusedError, digest, read_json, sweep, write_whole
 from fdi_gym.metrics import Outcome, outcome
 from fdi_gym.names import blamed, file_name
 from fdi_gym.plant import Plant
-from fdi_gym.provenance import provenance
+from fdi_gym.provenance import provenance, sources
 from fdi_gym.row import Evaluated, Made, Row, outcomes_digest
 from fdi_gym.scores import summarise
-from fdi_gym.suite import Suite
+from fdi_gym.suite import AnySuite
 
 BLOCK = 100  # episodes flown and diagnosed together
 
@@ -61,7 +62,7 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), "fdi-gym": fdi_gym.__version__} | libraries
 
 
-def settings_of(suite: Suite, plant: Plant, name: str) -> dict[str, Any]:
+def settings_of(suite: AnySuite, plant: Plant, name: str) -> dict[str, Any]:
     """The tuning that a diagnoser's builder gets on a suite, in full: its paper's, the name's own, the suite's.
 
     Raises:
@@ -74,33 +75,33 @@ def settings_of(suite: Suite, plant: Plant, name: str) -> dict[str, Any]:
         raise ValueError(f"{name}: its settings are not plain data: {error}") from error
 
 
-def digests_of(suite: Suite, plant: Plant, name: str) -> dict[str, str]:
+def digests_of(suite: AnySuite, plant: Plant, name: str) -> dict[str, str]:
     """Digests of what makes a diagnoser's row on a suite, beside the suite; see `provenance`, which uses the method once."""
     return provenance(name, plant, suite.process, settings_of(suite, plant, name))
 
 
-def diagnose(suite: Suite, plant: Plant, name: str, episodes: Sequence[int], record: Record | None = None) -> Block:
-    """Fly episodes of a suite, diagnose them and reduce them to outcomes.
+def diagnose(suite: AnySuite, plant: Plant, name: str, episodes: Sequence[int], record: Record | None = None) -> Block:
+    """Fly episodes of a suite, or read them, diagnose them and reduce them to outcomes.
 
     Raises:
         ValueError: The method's own code fails; `NotApplicableError` where it cannot run on this plant.
     """
     scenarios = suite.scenarios(plant, episodes)
-    record = simulate(plant, scenarios) if record is None else record
+    record = suite.record(plant, episodes) if record is None else record
     with blamed(name):
         diagnoser = make_diagnoser(
             name, plant, process=suite.process, scenarios=scenarios, **settings_of(suite, plant, name)
         )
-        diagnoser.update(diagnoser.init(len(scenarios)), record.obs[:, 0])  # what is done once is not timed
+        diagnoser.update(diagnoser.init(len(episodes)), record.obs[:, 0])  # what is done once is not timed
         start = time.process_time()
         said = run(diagnoser, record.obs)
         seconds = time.process_time() - start
     scoring = plant.process(suite.process).scoring
-    outcomes = [outcome(plant, scoring, record, said, i) for i in range(len(scenarios))]
+    outcomes = [outcome(plant, scoring, record, said, i) for i in range(len(episodes))]
     return Block(outcomes, seconds, int((record.length + 1).sum()))
 
 
-def applicable(suite: Suite, plant: Plant, names: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+def applicable(suite: AnySuite, plant: Plant, names: Sequence[str]) -> tuple[list[str], dict[str, str]]:
     """The diagnosers that can run on the suite's plant, and for the others the reason why not.
 
     Raises:
@@ -145,16 +146,16 @@ def write_block(path: Path, block: Block, identity: str) -> None:
 _flown: dict[tuple[Any, ...], tuple[Plant, Record]] = {}  # the last flights: methods are shown them one after the other
 
 
-def _fly(suite: Suite, episodes: range, plant_digest: str) -> tuple[Plant, Record]:
+def _fly(suite: AnySuite, episodes: range, plant_digest: str) -> tuple[Plant, Record]:
     key = (suite.sha256, episodes, plant_digest)
     if key not in _flown:
         plant = suite.build()
         _flown.clear()
-        _flown[key] = plant, simulate(plant, suite.scenarios(plant, episodes))
+        _flown[key] = plant, suite.record(plant, episodes)
     return _flown[key]
 
 
-def _run_block(suite: Suite, name: str, episodes: range, path: Path, identity: str, plant: str) -> tuple[str, int, float]:
+def _run_block(suite: AnySuite, name: str, episodes: range, path: Path, identity: str, plant: str) -> tuple[str, int, float]:
     """Fly one block, show it to one diagnoser and write what came of it: its name, the block's start and the time."""
     built, record = _fly(suite, episodes, plant)
     block = diagnose(suite, built, name, episodes, record)
@@ -165,7 +166,7 @@ def _run_block(suite: Suite, name: str, episodes: range, path: Path, identity: s
 class _Plan:
     """Which blocks there are to run, in which order: block after block, in each the quickest method first."""
 
-    def __init__(self, suite: Suite, plant: Plant, names: Sequence[str], work: Path, size: int):
+    def __init__(self, suite: AnySuite, plant: Plant, names: Sequence[str], work: Path, size: int):
         self.suite, self.plant, self.names = suite, plant, names
         self.folder = work / f"{suite.name}-{suite.sha256[:8]}"
         self.ranges = [range(i, min(i + size, suite.episodes)) for i in range(0, suite.episodes, size)]
@@ -226,8 +227,18 @@ class _Plan:
             self.failure = error
 
 
+def check_jobs(jobs: int) -> None:
+    """Check a number of worker processes.
+
+    Raises:
+        ValueError: It is out of range.
+    """
+    if jobs != -1 and jobs < 1:
+        raise ValueError(f"jobs is 1 or more, or -1 for one per core, not {jobs}")
+
+
 def evaluate(
-    suite: Suite,
+    suite: AnySuite,
     names: Sequence[str],
     *,
     work: Path,
@@ -252,8 +263,7 @@ def evaluate(
             of range.
         OSError: A block cannot be written; those that are finished stay.
     """
-    if jobs != -1 and jobs < 1:
-        raise ValueError(f"jobs is 1 or more, or -1 for one per core, not {jobs}")
+    check_jobs(jobs)
     if block < 1:
         raise ValueError(f"a block has 1 episode or more, not {block}")
     plant = suite.build()
@@ -261,6 +271,7 @@ def evaluate(
     plan = _Plan(suite, plant, list(dict.fromkeys(names)), work, block)
     plan.folder.mkdir(parents=True, exist_ok=True)
     sweep(plan.folder)
+    compile_kernels(sources({__name__, *(find_diagnoser(name).build.__module__ for name in plan.names)}), jobs, progress)
     total = len(plan.names) * len(plan.ranges)
     parallel: Any = joblib.Parallel(n_jobs=min(jobs, total), return_as="generator_unordered")
     with tqdm(total=total, desc=suite.name, unit="block", disable=not progress) as bar:
@@ -274,7 +285,7 @@ def evaluate(
 
 
 def _evaluated(
-    suite: Suite, plant: Plant, name: str, blocks: list[Block], digests: Mapping[str, str], command: str
+    suite: AnySuite, plant: Plant, name: str, blocks: list[Block], digests: Mapping[str, str], command: str
 ) -> Evaluated:
     outcomes = [episode for block in blocks for episode in block.outcomes]
     row = Row(

@@ -1,8 +1,9 @@
 """Fault scenarios: plain data that says what goes wrong, when and how; any episode can be replayed from one.
 
 All faults act through the plant's fault parameter theta, which has a nominal value, so that a healthy plant is no
-special case. A `Fault` is active on the steps `onset <= k < end` (step k is the interval from sample k to k + 1) and
-moves the entries of theta that its effects name; outside it they are nominal. Times are sample indices throughout.
+special case; those of its sensors too (`fdi_gym.sensors`). A `Fault` is active on the steps `onset <= k < end` (step k is
+the interval from sample k to k + 1) and moves the entries of theta that its effects name; outside it they are nominal.
+Times are sample indices throughout.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from msgspec import Meta
 
 from fdi_gym.drawing import stream
-from fdi_gym.plain import of_numpy, plain, value_at
+from fdi_gym.plain import UsualDict, of_numpy, plain, value_at
 
 MAX_STEPS = 1_000_000  # samples of a flight: what is recorded of it takes a gigabyte or less
 MAX_JSON = 2**25  # bytes of a scenario as text
@@ -30,6 +31,8 @@ Period = Annotated[float, Meta(ge=1e-9, le=1e12)]  # s
 Duty = Annotated[float, Meta(gt=0.0, le=1.0)]
 Step = Annotated[int, Meta(ge=0, le=MAX_STEPS)]
 Steps = Annotated[int, Meta(ge=1, le=MAX_STEPS)]
+Share = Annotated[float, Meta(ge=0.0, lt=1.0)]
+Length = Annotated[float, Meta(ge=1.0, le=1e6)]  # samples
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 
@@ -53,6 +56,13 @@ class Incipient(Effect, frozen=True, tag="incipient"):
 
     value: Finite
     rate: Rate
+
+
+class Ramp(Effect, frozen=True, tag="ramp"):
+    """theta runs straight from nominal at the onset to value, which it reaches after `duration` seconds, and stays there."""
+
+    value: Finite
+    duration: Period
 
 
 class Intermittent(Effect, frozen=True, tag="intermittent"):
@@ -96,8 +106,39 @@ class Fault(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mode: str
     kind: str
     onset: Step
-    effects: Annotated[list[Abrupt | Incipient | Intermittent | Square | Hold | Samples], Meta(min_length=1)]
+    effects: Annotated[list[Abrupt | Incipient | Ramp | Intermittent | Square | Hold | Samples], Meta(min_length=1)]
     end: Step | None = None
+
+
+class Sampling(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How the sensors report, which is no fault: a sample that does not come reads NaN, and the controller keeps the last.
+
+    Args:
+        dropout: Share of the samples of each sensor that go missing, at random.
+        burst: Mean length of a gap [samples], at least dropout / (1 - dropout). 1: whatever independent ones give.
+        periods: Samples from one reading of a sensor to the next, by its name. Default: every sample.
+        delays: Samples by which a sensor lags, by its name. Default: none.
+        hold: A sensor that does not report shows its last reading again, in place of NaN.
+
+    Raises:
+        ValueError: Gaps so short cannot take such a share.
+    """
+
+    dropout: Share = 0.0
+    burst: Length = 1.0
+    periods: dict[str, Steps] = {}
+    delays: dict[str, Step] = {}
+    hold: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.dropout < 1.0:
+            raise ValueError(f"dropout is a share from 0 up to, not including, 1, not {self.dropout!r}")
+        least = self.dropout / (1.0 - self.dropout)
+        if self.burst != 1.0 and not self.burst >= max(least, 1.0):
+            raise ValueError(
+                f"burst is a mean gap of at least {max(least, 1.0):g} samples for a dropout of {self.dropout:g}, or 1 for "
+                f"independent ones; not {self.burst!r}"
+            )
 
 
 class _Fields(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -111,6 +152,28 @@ class _Fields(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     physical: dict[str, Any] = {}
     x0: list[Finite] | None = None
     noise_seed: Seed = 0
+    sampling: Sampling | msgspec.UnsetType = msgspec.UNSET
+
+
+class _Usual(_Fields, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The same with dicts no deeper than the usual ones: what msgspec can check and copy in one pass."""
+
+    reference: UsualDict = {}
+    disturbance: UsualDict = {}
+    physical: UsualDict = {}
+
+
+def _usual(scenario: _Fields) -> _Fields | None:
+    """A checked copy of a scenario that holds Python's own values in the usual depth; None: of another, or a wrong one."""
+    try:
+        copy = msgspec.convert(msgspec.to_builtins(scenario), _Usual)
+        for name in DICTS:
+            given = getattr(scenario, name)
+            if type(given) is not dict or getattr(copy, name) != given:  # msgspec also makes lists of sets
+                return None
+    except Exception:  # whatever it is, it is searched and named by those who take longer
+        return None
+    return copy
 
 
 class FaultScenario(_Fields, frozen=True, kw_only=True):
@@ -129,15 +192,24 @@ class FaultScenario(_Fields, frozen=True, kw_only=True):
         physical: Physical parameters of the truth that differ from the diagnoser's model.
         x0: Initial state, or None for the plant's own.
         noise_seed: Seed of the sensor and process noise stream, 0 to 2^63 - 1.
+        sampling: How the sensors report. Default: each at every sample.
 
     Raises:
         ValueError: A field has a value that it cannot have; the message names it and what is allowed.
     """
 
     def __post_init__(self) -> None:
+        checked = _usual(self) or self._checked()
+        for name in self.__struct_fields__:
+            msgspec.structs.force_setattr(self, name, getattr(checked, name))
+        _check_windows(checked.faults)
+
+    def _checked(self) -> _Fields:
+        """A checked copy of any scenario, or the error that says what is wrong with it."""
         given: dict[str, Any] = {name: getattr(self, name) for name in self.__struct_fields__}
         dicts = {name: plain(given[name], name) for name in DICTS}
-        typed = {name: value for name, value in given.items() if type(dicts.get(name)) is not dict}
+        unset = {name for name, value in given.items() if value is msgspec.UNSET}
+        typed = {name: v for name, v in given.items() if type(dicts.get(name)) is not dict and name not in unset}
         try:
             data = msgspec.to_builtins(typed, enc_hook=of_numpy)
             checked = msgspec.convert(data, _Fields)
@@ -145,9 +217,9 @@ class FaultScenario(_Fields, frozen=True, kw_only=True):
             raise ValueError(f"not a FaultScenario: {error}{value_at(str(error), data)}") from None
         except RecursionError:
             raise ValueError("not a FaultScenario: it contains itself") from None
-        for name in given:
-            msgspec.structs.force_setattr(self, name, dicts[name] if name in dicts else getattr(checked, name))
-        _check_windows(checked.faults)
+        for name in DICTS:
+            msgspec.structs.force_setattr(checked, name, dicts[name])
+        return checked
 
     def to_json(self) -> str:
         """The scenario as JSON text.

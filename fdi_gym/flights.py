@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi_gym import closed_loop
+from fdi_gym.bounds import check_bounds
 from fdi_gym.closed_loop import FLYING, OVER, TERMINATED
-from fdi_gym.faults import Abrupt, FaultScenario, Hold, Incipient, Intermittent, Samples, Square
+from fdi_gym.faults import Abrupt, Effect, FaultScenario, Hold, Incipient, Intermittent, Ramp, Samples, Sampling, Square
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Plant
 from fdi_gym.truth import Inputs
@@ -28,9 +29,10 @@ class Chunk(NamedTuple):
     label: Array  # (m, N) int64
 
 
-class _Made(NamedTuple):
-    """What a flight follows: tables, the true label's changes, injected noise."""
+class Prepared(NamedTuple):
+    """A flight that can begin: its scenario, tables, the true label's changes, injected noise."""
 
+    scenario: FaultScenario
     inputs: Inputs
     labels: list[tuple[int, int]]
     noise: tuple[Array | None, Array | None]
@@ -41,7 +43,23 @@ def _signals(plant: Plant) -> tuple[Any, ...]:
     boxes = [np.array([[s.low for s in signals], [s.high for s in signals]], float).reshape(2, -1)
              for signals in (plant.outputs, plant.commands)]  # fmt: skip
     sigma = np.array([s.sigma for s in (*plant.outputs, *plant.states)])
-    return *boxes, sigma, plant.noise_limit, np.array([plant.reference_width, len(plant.disturbances)], np.int64)
+    widths = plant.reference_width, len(plant.disturbances), plant.own_theta, plant.healthy_feedback
+    return *boxes, sigma, plant.noise_limit, np.array(widths, np.int64)
+
+
+def effects_lag(plant: Plant, effect: Effect) -> int:
+    """By how many samples an effect makes a sensor lag, at most."""
+    if plant.bare is None or plant.theta_entries.index(effect.entry) not in plant.lags:
+        return 0
+    match effect:
+        case Samples(values=values):
+            return int(max(values))
+        case Square(value=value, other=other):
+            return int(max(value, other))
+        case Hold():
+            return 0
+        case _:
+            return int(effect.value)  # type: ignore[attr-defined]
 
 
 class Flights:
@@ -51,14 +69,14 @@ class Flights:
         plant: The plant; its physical parameters come from each scenario.
         scenarios: One per flight; they may differ in length.
         noise: (w (K, n_x), v (K + 1, n_y)) per flight. Default: by counter, from each scenario's noise seed.
-        longest_lag: Samples that a sensor fault may lag behind.
+        longest_lag: Samples that a sensor may lag behind by the table that `advance` takes; scenarios say it themselves.
 
     Attributes:
         k: (N,) the sample that each flight comes to next; the last one where it is over.
         length: (N,) its last sample: as the scenario says, until it ends early.
 
     Raises:
-        ValueError: A scenario that the plant refuses, or noise of another shape.
+        ValueError: A scenario that the plant refuses, noise of another shape, or a kernel that reaches beyond its arrays.
     """
 
     def __init__(
@@ -68,6 +86,7 @@ class Flights:
         noise: Sequence[tuple[Array, Array]] | None = None,
         longest_lag: int = 0,
     ):
+        check_bounds(plant)
         n = len(scenarios)
         n_x, n_y, n_u, n_theta = (len(a) for a in (plant.states, plant.outputs, plant.commands, plant.theta))
         self.plant = plant
@@ -77,7 +96,8 @@ class Flights:
         self.seed, self.status = np.zeros(n, np.uint64), np.full(n, OVER, np.int64)
         self.x, self.c, self.u = np.zeros((n, n_x)), np.zeros((n, len(plant.c0))), np.zeros((n, n_u))
         self.theta, self.p = np.zeros((n, n_theta)), np.zeros((n, len(plant.nominal_p)))
-        self.readings, self.history = np.zeros((n, n_y)), np.zeros((n, longest_lag + 1 if longest_lag else 0, n_y))
+        self.readings, self.history = np.zeros((n, 2, n_y)), np.zeros((n, longest_lag + 1 if longest_lag else 0, n_y))
+        self.reporting, self.dropped = np.zeros((0, n_y, closed_loop.REPORTING)), np.zeros((0, n_y))
         self.effects, self.held = np.zeros((n, 1, closed_loop.COLUMNS)), np.zeros((n, 1))
         self.counts, self.labels = np.zeros(n, np.int64), np.full((n, 2, 2), NEVER)
         self.tables: list[tuple[Any, ...]] = [()] * n  # reference, disturbance, w, v and samples of effects: by address
@@ -117,31 +137,40 @@ class Flights:
         noise: Sequence[tuple[Array, Array]] | None = None,
     ) -> None:
         """Put new flights in these slots; the others go on. What is refused leaves all as they are."""
+        made = [self.prepare(s, None if noise is None else noise[number]) for number, s in enumerate(scenarios)]
+        self.put(slots, made)
+
+    def prepare(self, scenario: FaultScenario, noise: tuple[Array, Array] | None = None) -> Prepared:
+        """A flight that `put` can begin at any time: what takes long is done here.
+
+        Raises:
+            ValueError: A scenario that the plant refuses, or noise of another shape.
+        """
+        self.plant.validate(scenario)
+        given = (None, None) if noise is None else self._checked_noise(noise, scenario.steps)
+        return Prepared(scenario, self.plant.inputs(scenario), self.plant.label_changes(scenario), given)
+
+    def put(self, slots: Iterable[int], made: Sequence[Prepared]) -> None:
+        """Begin prepared flights in these slots; the others go on."""
         plant, where = self.plant, np.array(list(slots))
-        made = [self._made(s, None if noise is None else noise[number]) for number, s in enumerate(scenarios)]
         if len(where) != len(made):
             raise ValueError(f"one scenario for each of the {len(where)} slots is needed, not {len(made)}")
         if not made:
             return
         self.k[where], self.status[where], self.x[where], self.c[where] = 0, FLYING, plant.trim_state, plant.c0
         self.u[where], self.theta[where] = plant.trim_command, plant.nominal_theta
-        self.length[where] = [scenario.steps for scenario in scenarios]
-        self.seed[where] = np.array([scenario.noise_seed for scenario in scenarios], np.uint64)
-        self.p[where] = [inputs.physical for inputs, *_ in made]
-        self.steps[:, where] = np.array([(len(i.reference) > 1, len(i.disturbance) > 1) for i, *_ in made]).T
-        for i, scenario, (inputs, labels, given) in zip(where.tolist(), scenarios, made, strict=True):
+        self.length[where] = [flight.scenario.steps for flight in made]
+        self.seed[where] = np.array([flight.scenario.noise_seed for flight in made], np.uint64)
+        self.p[where] = [flight.inputs.physical for flight in made]
+        self.steps[:, where] = np.array([(len(f.inputs.reference) > 1, len(f.inputs.disturbance) > 1) for f in made]).T
+        for i, (scenario, inputs, labels, given) in zip(where.tolist(), made, strict=True):
             if scenario.x0 is not None:
                 self.x[i] = scenario.x0
             samples = self._set_effects(i, scenario)
+            self._set_sampling(i, scenario)
             self._set_labels(i, labels)
             self.tables[i] = (inputs.reference, inputs.disturbance, *given, samples)
             self._point(i)
-
-    def _made(self, scenario: FaultScenario, noise: tuple[Array, Array] | None) -> _Made:
-        """What a scenario that the plant accepts makes."""
-        self.plant.validate(scenario)
-        given = (None, None) if noise is None else self._checked_noise(noise, scenario.steps)
-        return _Made(self.plant.inputs(scenario), self.plant.label_changes(scenario), given)
 
     def _checked_noise(self, noise: tuple[Array, Array], steps: int) -> tuple[Array, Array]:
         w, v = (contiguous(a) for a in noise)
@@ -161,6 +190,8 @@ class Flights:
                         what = (closed_loop.ABRUPT, value, 0, 0)
                     case Incipient(value=value, rate=rate):
                         what = (closed_loop.INCIPIENT, value, rate, 0)
+                    case Ramp(value=value, duration=duration):
+                        what = (closed_loop.RAMP, value, duration, 0)
                     case Intermittent(value=value, period=period, duty=duty):
                         what = (closed_loop.INTERMITTENT, value, period, duty)
                     case Square(value=value, other=other, period=period):
@@ -183,6 +214,35 @@ class Flights:
                     self.held[i, e] = plant.trim_command[row[5]]
         return samples
 
+    def _set_sampling(self, i: int, scenario: FaultScenario) -> None:
+        """How flight i's sensors report, and room for the past that the slowest of them shows."""
+        plant, said = self.plant, scenario.sampling
+        lags = [effects_lag(plant, effect) for fault in scenario.faults for effect in fault.effects]
+        longest = max(lags, default=0) + (max(said.delays.values(), default=0) if isinstance(said, Sampling) else 0)
+        if longest >= max(self.history.shape[1], 1):
+            self._remember(longest)
+        if len(self.reporting):
+            self.reporting[i], self.dropped[i] = 0.0, 0.0
+        if not isinstance(said, Sampling):
+            return
+        if not len(self.reporting):
+            self.reporting, self.dropped = (np.zeros((len(self), *a.shape[1:])) for a in (self.reporting, self.dropped))
+        rows, p = self.reporting[i], said.dropout
+        stay = p if said.burst == 1.0 else 1.0 - 1.0 / said.burst
+        rows[:, closed_loop.AGAIN] = said.hold
+        rows[:, closed_loop.BEGIN], rows[:, closed_loop.STAY] = (1.0 - stay) * p / (1.0 - p), stay
+        for column, by_name in ((closed_loop.PERIOD, said.periods), (closed_loop.DELAY, said.delays)):
+            for j, output in enumerate(plant.outputs):
+                rows[j, column] = by_name.get(output.name, 0)
+
+    def _remember(self, longest: int) -> None:
+        """A longer history; that of the flights under way is kept."""
+        before = self.history
+        self.history = np.zeros((before.shape[0], longest + 1, before.shape[2]))
+        for i, k in enumerate(self.k.tolist()):
+            past = np.arange(max(k - before.shape[1], 0), k)
+            self.history[i, past % (longest + 1)] = before[i, past % max(before.shape[1], 1)]
+
     def _set_labels(self, i: int, changes: list[tuple[int, int]]) -> None:
         if len(changes) >= self.labels.shape[1]:
             more = len(changes) + 1 - self.labels.shape[1]
@@ -201,7 +261,8 @@ class Flights:
         return (
             self.seed, self.length, *self.addresses, *self.steps,
             self.p, self.effects, self.counts, self.values, self.labels,
-            self.k, self.status, self.x, self.c, self.u, self.theta, self.held, self.readings, self.history,
+            self.reporting, self.k, self.status, self.x, self.c, self.u, self.theta, self.held, self.readings, self.history,
+            self.dropped,
         )  # fmt: skip
 
     def blank(self, samples: int) -> Chunk:

@@ -10,15 +10,18 @@ from fdi_gym.kernels import M, V, compiled, map_at, project_at
 @numba.njit
 def _theta_at(tau, a, b, g, theta):
     for j in range(theta.size):
-        theta[j] = a[j] if b[j] == 0.0 else a[j] + b[j] * np.exp(-g[j] * tau)
+        if b[j] == 0.0:
+            theta[j] = a[j]
+        else:
+            theta[j] = a[j] + b[j] * (tau if g[j] < 0.0 else np.exp(-g[j] * tau))
 
 
-@numba.njit
+@numba.njit(inline="always")
 def interval(dynamics, project, t, dt, substeps, x, u, drifts, a, b, g, d, p, theta, k1, k2, k3, k4, z):
-    """One sample interval: x(t) -> x(t + dt) in place, theta(t + tau) = a + b exp(-g tau), u and d held.
+    """One sample interval: x(t) -> x(t + dt) in place, theta(t + tau) = a + b exp(-g tau), or a + b tau where g < 0.
 
-    Classical Runge-Kutta with `substeps` steps; for `substeps` = 0 the plant is discrete and maps x itself. `drifts` says
-    whether any b is not 0.
+    u and d are held. Classical Runge-Kutta with `substeps` steps; for `substeps` = 0 the plant is discrete and maps x
+    itself. `drifts` says whether any b is not 0.
     """
     n = x.size
     _theta_at(0.0, a, b, g, theta)

@@ -13,6 +13,7 @@ beside the percentile bootstrap.
 
 from __future__ import annotations
 
+import functools
 from collections import Counter
 from collections.abc import Sequence
 
@@ -35,7 +36,7 @@ def strata(truths: Sequence[Sequence[int]]) -> Array:
     values, counts = np.unique(found, return_counts=True)
     found[np.isin(found, values[counts == 1])] = -1
     values, counts = np.unique(found, return_counts=True)
-    if len(values) > 1 and (found == -1).sum() == 1:
+    if (found == -1).sum() == 1:
         found[found == -1] = values[np.argmax(np.where(values == -1, 0, counts))]
     return found
 
@@ -91,10 +92,19 @@ def balanced_interval(hits: Array, counts: Array, stratum: Array) -> list[float]
 
 
 def resamples(stratum: Array, count: int, seed: int = 0) -> Array:
-    """How often each flight is drawn (count, N) in bootstrap resamples within strata; the same for all rows of a suite."""
-    rng = np.random.default_rng(seed)
-    found = np.zeros((count, len(stratum)))
-    for s in np.unique(stratum):
-        mine = np.flatnonzero(stratum == s)
+    """How often each flight is drawn (count, N) in bootstrap resamples within strata; the same for all rows of a suite.
+
+    The array is shared, not to be written.
+    """
+    return _resamples(tuple(stratum.tolist()), count, seed)
+
+
+@functools.lru_cache(maxsize=4)
+def _resamples(stratum: tuple[int, ...], count: int, seed: int) -> Array:
+    rng, of = np.random.default_rng(seed), np.array(stratum)
+    found = np.zeros((count, len(of)))
+    for s in np.unique(of):
+        mine = np.flatnonzero(of == s)
         found[:, mine] = rng.multinomial(len(mine), np.full(len(mine), 1 / len(mine)), count)
+    found.flags.writeable = False
     return found

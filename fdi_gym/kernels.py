@@ -23,16 +23,16 @@ absent one, and where nothing can be written, everything is compiled in each pro
 
 from __future__ import annotations
 
-import ast
 import functools
 import hashlib
 import importlib
 import inspect
 import os
 import pickle
+import re
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -71,30 +71,31 @@ def sources(path: Path) -> tuple[Path, ...]:
     return tuple(sorted(found))
 
 
+# An import of the package and what it names; in a docstring it only makes one file more to watch
+_IMPORT = re.compile(
+    r"(?:^|[:;])[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]*(\([^)]*\)|.*)|import[ \t]+(.*))", re.MULTILINE
+)
+
+
 @functools.cache
 def _imported(path: Path) -> tuple[Path, ...]:
-    """The files of the package that a source file imports."""
+    """The files of the package that a source file imports. By its lines: its syntax tree would take 40 ms of each start."""
     root, files = Path(__file__).resolve().parent, set()
-    for node in _statements(ast.parse(path.read_bytes()).body):
-        names = []
-        if isinstance(node, ast.ImportFrom) and node.module:
-            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-        elif isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        for name in names:
+    for module, names, modules in _IMPORT.findall(path.read_text(encoding="utf-8")):
+        found = (
+            [module, *(f"{module}.{name}" for name in re.findall(r"\w+", names))]
+            if module
+            else re.findall(r"[\w.]+", modules)
+        )
+        for name in found:
             package, *rest = name.split(".")
             if package == root.name and (file := root.joinpath(*rest).with_suffix(".py")).is_file():
                 files.add(file)
     return tuple(files)
 
 
-def _statements(body: Iterable[ast.AST]) -> Iterator[ast.AST]:
-    """The statements of a body and of those within it; not their expressions, which import nothing."""
-    for node in body:
-        yield node
-        for part in ("body", "orelse", "finalbody", "handlers", "cases"):
-            yield from _statements(getattr(node, part, ()))
-
+njit: Any = numba.njit  # what only kernels call needs no way in from Python or C, slow to compile: `helper`
+helper = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 _signatures: dict[Any, Any] = {}  # of the kernels, compiled when they are first needed
 _announced: set[str] = set()  # source files whose cold compilation has been announced
@@ -173,7 +174,7 @@ class _Cache(caching.FunctionCache):
 def _lazily(function: Callable[..., Any], signature: Any) -> Any:
     """The function as numba's dispatcher, cached in the folder of its sources; nothing is compiled yet."""
     folder = cache_folder(function.__code__.co_filename)
-    dispatcher = numba.njit(error_model="numpy", nogil=True)(function)
+    dispatcher = njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True)(function)
     if folder is not None:
         settings: Any = config
         before = settings.CACHE_DIR
@@ -188,7 +189,7 @@ def _lazily(function: Callable[..., Any], signature: Any) -> Any:
     return dispatcher
 
 
-def _load(dispatcher: Any) -> Any:
+def load(dispatcher: Any) -> Any:
     """The dispatcher, compiled for its role's signature or loaded from the cache."""
     if dispatcher.overloads:
         return dispatcher
@@ -204,6 +205,12 @@ def _load(dispatcher: Any) -> Any:
     return dispatcher
 
 
+def uncompiled(modules: Collection[str]) -> list[Any]:
+    """The kernels of these modules, as far as they are imported, that the cache should have and does not have yet."""
+    found = [d for d in _signatures if d.py_func.__module__ in modules and not d.overloads and isinstance(d._cache, _Cache)]
+    return [d for d in found if not Path(d._cache._cache_file._index_path).is_file()]
+
+
 def kernel(function: Callable[..., Any]) -> Any:
     """Make a plant's function a kernel of the role that its parameter names declare (see the module's docstring)."""
     role = _ROLES.get(tuple(inspect.signature(function).parameters))
@@ -216,16 +223,9 @@ def compiled(signature: Any) -> Callable[[Any], Any]:
     """Make a generic kernel: compiled for this signature at its first call, cached; it runs without the GIL."""
 
     def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher, loaded = _lazily(function, signature), None
-
-        @functools.wraps(function)
-        def call(*arguments: Any) -> Any:
-            nonlocal loaded
-            if loaded is None:
-                loaded = _load(dispatcher)
-            return loaded(*arguments)
-
-        return call
+        dispatcher = _lazily(function, signature)
+        dispatcher._compile_for_args = lambda *_: load(dispatcher)  # numba asks this where nothing fits, and calls it
+        return dispatcher
 
     return decorate
 
@@ -253,7 +253,7 @@ def _arrived(module: str, name: str) -> Any:
 
 def address(dispatcher: Any) -> int:
     """The address of a kernel, compiled if need be, by which the generic kernels call it. Valid as long as it lives."""
-    (result,) = _load(dispatcher).overloads.values()
+    (result,) = load(dispatcher).overloads.values()
     return result.library.get_pointer_to_function(result.fndesc.llvm_func_name)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 from fdi_gym.comparison import Drawn, cliques, draw_again, tied_with_best
@@ -10,7 +12,7 @@ from fdi_gym.files import RefusedError
 from fdi_gym.metrics import Outcome
 from fdi_gym.plant import Plant
 from fdi_gym.row import Row, read_made, read_outcomes, read_row, row_files
-from fdi_gym.suite import Suite, load_suite
+from fdi_gym.suite import AnySuite, load_suite
 from fdi_gym.tables import (
     FLOOR,
     RANKINGS,
@@ -60,7 +62,7 @@ times per sample on the machine of the run, in blocks of 100 flights.
 class Board(NamedTuple):
     """All that is on a suite's page."""
 
-    suite: Suite
+    suite: AnySuite
     plant: Plant
     rows: list[Row]
     outcomes: dict[str, list[Outcome]]
@@ -92,13 +94,18 @@ def read_rows(folder: Path) -> list[Row]:
     return rows
 
 
-def read_board(folder: Path) -> Board:
+def read_board(folder: Path, suites: Mapping[str, AnySuite] = MappingProxyType({})) -> Board:
     """A suite's rows, each checked against its outcomes.
+
+    Args:
+        folder: Of the suite's rows.
+        suites: By name, those that are not installed.
 
     Raises:
         RefusedError: A row does not agree with its outcomes or its suite; it is named.
     """
-    suite, rows, outcomes = load_suite(folder.name), read_rows(folder), {}
+    suite = suites[folder.name] if folder.name in suites else load_suite(folder.name)
+    rows, outcomes = read_rows(folder), {}
     plant = suite.build()
     for path, row in zip(row_files(folder), rows, strict=True):
         outcomes[row.diagnoser] = read_outcomes(path, row, plant)
@@ -143,6 +150,11 @@ def page(board: Board) -> str:
     return "\n".join(parts)
 
 
+def framing(board: Board) -> list[Row]:
+    """The rows that frame a ranking: floor and ceilings."""
+    return [row for row in board.rows if row.diagnoser in FLOOR or ceiling(row)]
+
+
 def draw(board: Board, folder: Path) -> None:
     """Draw the pictures of a suite's page into a folder: the ranking, and what the best row confuses."""
     from fdi_gym import plots
@@ -152,20 +164,26 @@ def draw(board: Board, folder: Path) -> None:
         return
     folder.mkdir(parents=True, exist_ok=True)
     rows = RANKINGS["Isolation"][0](board.honest())
-    frame = [row for row in board.rows if row.diagnoser in FLOOR or ceiling(row)]
     drawn = board.drawn(rows)
-    plots.ranking(rows, frame, cliques(drawn)).savefig(folder / f"{board.suite.name}-ranking.png")
+    plots.ranking(rows, framing(board), cliques(drawn), board.suite.episodes).savefig(
+        folder / f"{board.suite.name}-ranking.png"
+    )
     labels = [label.name for label in board.plant.labels]
     plots.confusions(best, labels).savefig(folder / f"{board.suite.name}-confusion.png")
 
 
-def boards(results: Path) -> list[Board]:
+def boards(results: Path, suites: Sequence[str] = ()) -> list[Board]:
     """The boards of all suites in the folder of rows.
+
+    Args:
+        results: The folder.
+        suites: Paths, or "module:name", of suites that are not installed.
 
     Raises:
         RefusedError: As `read_board`.
     """
-    return [read_board(folder) for folder in sorted(path for path in results.glob("*") if path.is_dir())]
+    found = {suite.name: suite for suite in map(load_suite, suites)}
+    return [read_board(folder, found) for folder in sorted(path for path in results.glob("*") if path.is_dir())]
 
 
 def front(found: list[Board]) -> str:
@@ -186,11 +204,11 @@ def front(found: list[Board]) -> str:
     return f"{INTRODUCTION}\n{markdown(head, lines)}\n" if lines else INTRODUCTION
 
 
-def render(results: Path) -> dict[str, str]:
-    """All pages by file name.
+def render(results: Path, suites: Sequence[str] = ()) -> dict[str, str]:
+    """All pages by file name; arguments as `boards`.
 
     Raises:
         RefusedError: As `read_board`: no page is made.
     """
-    found = boards(results)
+    found = boards(results, suites)
     return {"README.md": front(found), **{f"{board.suite.name}.md": page(board) for board in found}}

@@ -16,11 +16,12 @@ from fdi_gym.diagnosis import (
     make_diagnoser,
     trainers,
 )  # fmt: skip
-from fdi_gym.diagnosis.registry import GIVEN
+from fdi_gym.diagnosis.registry import GIVEN, GROUPS
 from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.faults import draw
 from fdi_gym.names import blamed, find_module, unknown
-from fdi_gym.suite import Suite, load_suite, suite_names
+from fdi_gym.recordings.suite import RecordedSuite
+from fdi_gym.suite import AnySuite, load_suite, suite_names
 
 
 def find_plant(text: str) -> tuple[str, str]:
@@ -33,19 +34,32 @@ def find_plant(text: str) -> tuple[str, str]:
         ValueError: There is none.
     """
     module, _, name = text.rpartition(":")
+    found = as_plant(text)
+    if found is None:
+        raise unknown("plant", name, plant_sources())
+    return module, found
+
+
+def as_plant(text: str) -> str | None:
+    """The id of the plant that a plant or environment id names, "module:id" too; None where it names none.
+
+    Raises:
+        ValueError: The module before a ":" cannot be imported.
+    """
+    module, _, name = text.rpartition(":")
     if module:
         find_module(module)
     ids = {f"{plant}-Faults-v{source.version}": plant for plant, source in plant_sources().items()}
-    if name not in ids and name not in ids.values():
-        raise unknown("plant", name, ids.values())
-    return module, ids.get(name, name)
+    return name if name in ids.values() else ids.get(name)
 
 
 def overview() -> str:
     """Names of all environments, suites, diagnosers and trainers, with a line for each; what is broken is listed as such."""
     lines = ["Environments", *(f"  {name}-Faults-v{source.version}" for name, source in plant_sources().items())]
     lines += ["", "Suites", *(f"  {name:32s} {_said(lambda n=name: load_suite(n).description)}" for name in suite_names())]
-    lines += ["", "Diagnosers", *(f"  {name:32s} {entry.summary}" for name, entry in diagnosers().items())]
+    marked = {name: "*" if GROUPS["reference"](entry) else "" for name, entry in diagnosers().items()}
+    lines += ["", 'Diagnosers (*: in the group "reference"; "all" is the group of all)']
+    lines += [f"  {name:30s} {marked[name]:1s} {entry.summary}" for name, entry in diagnosers().items()]
     lines += ["", "Trainers", *(f"  {name:32s} {found.summary}" for name, found in trainers().items())]
     if broken := broken_plugins():
         lines += ["", "Broken plug-ins", *(f"  {name:32s} {reason}" for name, reason in broken.items())]
@@ -95,7 +109,10 @@ def _outside(text: str, name: str) -> str:
     return _diagnoser(find_diagnoser(text))
 
 
-def _suite(suite: Suite) -> str:
+def _suite(suite: AnySuite) -> str:
+    if isinstance(suite, RecordedSuite):
+        lines = [f"{suite.name}: {suite.description}", "", f"  recorded     {suite.episodes} flights, {suite.env}"]
+        return "\n".join([*lines, f"  layout       {suite.layout}", f"  version      {suite.sha256[:12]}"])
     lines = [f"{suite.name}: {suite.description}", "", f"  environment  {suite.env}", f"  options      {suite.options}"]
     lines += [f"  process      {suite.process}", f"  mismatch     {suite.mismatch}"]
     seeds = [*suite.seeds, *suite.healthy]

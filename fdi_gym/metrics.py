@@ -51,7 +51,7 @@ class Decision(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     label: Label  # the true one
     declared: Declared
-    band: Count | None  # severity band at the end of the window, None where healthy
+    band: Count | None  # severity band at the end of the window, None where healthy or not known
 
 
 class Stated(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -67,7 +67,7 @@ class Found(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     onset: int  # declared less true, in samples
     overlap: float  # of the two windows, as a share of their union
-    size: float  # declared less true, as a share of the mode's reach
+    size: float | None  # declared less true, as a share of the mode's reach; None where the true one is not known
 
 
 class Declaration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -134,7 +134,7 @@ def check_outcomes(outcomes: Sequence[Outcome], labels: int, entries: int) -> No
             != (len(BANDS), len(PHASES), len(PHASES)) or len(episode.alarmed) != 2
             or any(len(part) != entries for part in entry_wise),
             "an unknown severity": any(d.band is not None and d.band >= len(BANDS) for d in episode.decisions),
-            "a severity of no fault": any((d.band is None) != (d.label == 0) for d in episode.decisions),
+            "a severity of no fault": any(d.band is not None and d.label == 0 for d in episode.decisions),
             "a delay beyond its fault": any(d is not None and d > o.length for o in episode.onsets
                                             for d in (o.detection, o.isolation)),
             "a delay of what was there before": any(((o.alarmed or not o.fresh) and o.detection is not None)
@@ -149,7 +149,7 @@ def check_outcomes(outcomes: Sequence[Outcome], labels: int, entries: int) -> No
 
 
 def _possible(said: Declaration, steps: int) -> bool:
-    within = all(abs(f.onset) <= steps and 0 <= f.overlap <= 1 and abs(f.size) < 1e12 for f in said.found)
+    within = all(abs(f.onset) <= steps and 0 <= f.overlap <= 1 and abs(f.size or 0.0) < 1e12 for f in said.found)
     whole = len(said.found) <= said.modes and (len(said.found) == said.modes or not said.exact)
     return within and whole and 0 <= said.worth <= 1 and (said.exact or said.worth == 0)
 
@@ -165,13 +165,14 @@ def scored_samples(label: Array, length: int, scoring: Scoring) -> Array:
 
 
 def severity_bands(plant: Plant, label: Array, theta: Array) -> Array:
-    """Band index (K + 1,) of each sample by the size of its smallest active fault; -1 where healthy."""
+    """Band index (K + 1,) of each sample by the size of its smallest active fault; -1 where healthy or not known."""
     band = np.full(len(label), -1)
     modes = {mode.name: mode for mode in plant.modes}
     for index in np.unique(label[label > 0]):
         mine = label == index
-        of_modes = [np.digitize(modes[name].size(theta[mine]), modes[name].bands) for name in plant.labels[index].modes]
-        band[mine] = np.min(of_modes, axis=0)
+        sizes = [(modes[name].size(theta[mine]), modes[name].bands) for name in plant.labels[index].modes]
+        known = np.isfinite([size for size, _ in sizes]).all(axis=0)
+        band[mine] = np.where(known, np.min([np.digitize(size, bands) for size, bands in sizes], axis=0), -1)
     return band
 
 
@@ -224,8 +225,8 @@ def _declaration(plant: Plant, label: Array, target: Array, said: Array, estimat
     both = np.flatnonzero(np.isfinite(wrong.onset[0]))
     return Declaration(
         int(truth[0, :, PRESENT].sum()), bool(wrong.exact[0]), float(wrong.worth[0]),
-        [Found(int(wrong.onset[0, i]), float(wrong.overlap[0, i]), float(wrong.size[0, i] / span[i] if span[i] else 0.0))
-         for i in both],
+        [Found(int(wrong.onset[0, i]), float(wrong.overlap[0, i]), None if np.isnan(wrong.size[0, i])
+               else float(wrong.size[0, i] / span[i] if span[i] else 0.0)) for i in both],
     )  # fmt: skip
 
 
@@ -264,7 +265,7 @@ def outcome(plant: Plant, scoring: Scoring, record: Record, said: Decisions, i: 
     return Outcome(
         steps=length, terminated=bool(record.terminated[i]), lost=bool((mode[1 : length + 1] < 0).any()),
         decisions=[Decision(value, decide(scoring.decision, mode, first, stop, scored),
-                            int(band[stop - 1]) if value > 0 else None)
+                            int(band[stop - 1]) if band[stop - 1] >= 0 else None)
                    for first, stop, value in windows(label, length, scored)],
         confusion=[(int(a), int(b), int(c)) for (a, b), c in zip(pairs, counts, strict=True)],
         banded=[(int((scored & (band == b)).sum()), int((scored & (band == b) & (mode == label)).sum()))

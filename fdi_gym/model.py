@@ -10,10 +10,19 @@ from typing import Any
 import numpy as np
 
 Array = np.ndarray
+FLOAT = np.dtype(float)
+
+SENSOR_FAULTS = ("gain", "bias", "noise", "frozen", "lag", "missing")  # columns of `fdi_gym.sensors`, in order
+
+
+class NotApplicableError(ValueError):
+    """A method's word that it cannot run on a plant, with the reason (no unknown input, rank condition)."""
 
 
 def contiguous(a: Any) -> Array:
     """As the compiled kernels take an array: float64, in C order and writable; a copy only of one that is not."""
+    if type(a) is Array and a.dtype is FLOAT and a.flags.carray:
+        return a
     a = np.ascontiguousarray(a, float)
     return a if a.flags.writeable else a.copy()
 
@@ -28,6 +37,7 @@ class Model:
     outputs: tuple[Any, ...]
     commands: tuple[Any, ...]
     theta: tuple[Any, ...]
+    bare: Any
     disturbances: tuple[Any, ...]
     physical: Callable[[Mapping[str, Any]], Array]
 
@@ -35,6 +45,18 @@ class Model:
     def nominal_theta(self) -> Array:
         """The healthy fault parameter (n_theta,)."""
         return np.array([s.nominal for s in self.theta])
+
+    @functools.cached_property
+    def own_theta(self) -> int:
+        """How many entries of theta the equations get; the others are faults of the sensors."""
+        return len(self.theta if self.bare is None else self.bare.theta)
+
+    @functools.cached_property
+    def lags(self) -> range:
+        """The positions in theta of the sensors' lags; none where sensors don't fail."""
+        column, n_y = SENSOR_FAULTS.index("lag"), len(self.outputs)
+        first = self.own_theta + column * n_y
+        return range(0) if self.bare is None else range(first, first + n_y)
 
     @functools.cached_property
     def nominal_p(self) -> Array:
@@ -53,8 +75,15 @@ class Model:
 
     @functools.cached_property
     def addresses(self) -> tuple[int, ...]:
-        """Addresses of the compiled kernels in the order of `Kernels`, with the defaults where the plant has none."""
+        """Addresses of the compiled kernels in the order of `Kernels`, with the defaults where the plant has none.
+
+        Raises:
+            NotApplicableError: The plant declares channels, and no equations.
+        """
         from fdi_gym import kernels
+
+        if self.kernels is None:
+            raise NotApplicableError("needs equations; this plant declares channels only")
 
         given = zip(self.kernels._fields, self.kernels, strict=True)
         return tuple(kernels.address(function or getattr(kernels, role)) for role, function in given)
@@ -79,7 +108,8 @@ class Model:
                 raise ValueError(f"{name} has {n} columns and rows that serve the {len(points)} points alike, not {a.shape}")
         if len(points) % times.size if times.size else len(points):
             raise ValueError(f"t is one number, or serves the {len(points)} points alike, not {times.size} numbers")
-        return times, *rows, np.empty((len(points), width))
+        own = contiguous(rows[2][:, : self.own_theta])
+        return times, *rows[:2], own, *rows[3:], np.empty((len(points), width))
 
     @functools.cached_property
     def _widths(self) -> tuple[int, ...]:
@@ -112,7 +142,12 @@ class Model:
         x = np.asarray(x, float)
         rows = self._rows_of(t, x, u, theta, d, p, len(self.outputs))
         integration.evaluate(self.addresses[1], *rows)
-        return rows[-1].reshape(*x.shape[:-1], len(self.outputs))
+        y, own, n_y = rows[-1], self.own_theta, len(self.outputs)
+        if theta is not None and own < len(self.theta):  # gains and biases of the sensors
+            wrong = self._rows(theta, self.nominal_theta)[:, own : own + 2 * n_y]
+            wrong = np.repeat(wrong, len(y) // max(len(wrong), 1), axis=0)
+            y += y * wrong[:, :n_y] + wrong[:, n_y:]
+        return y.reshape(*x.shape[:-1], n_y)
 
     def derivative(self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None) -> Array:
         """xdot at x (..., n_x); arguments as in `propagate`. For a discrete plant it is the next state."""

@@ -61,6 +61,14 @@ def blame(error: BaseException) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split()) or 'no message'}{place}"
 
 
+def in_a_line(error: ValueError | OSError) -> str:
+    """An error that a user can mend, after whose it is."""
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        text = error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
+    return " ".join("".join([*(f"{note}: " for note in getattr(error, "__notes__", [])), text]).split())
+
+
 def find_module(name: str) -> Any:
     """A module by name, imported.
 

@@ -6,7 +6,8 @@ easy as 1, 2, 3, SC'11, doi 10.1145/2063384.2063405). Its 64-bit words become no
 W. W. Tsang (J. Statistical Software 5(8), 2000, doi 10.18637/jss.v005.i08), 256 layers of equal area; a word that misses
 its layer (1.2 % of them) goes on with words of a counter of its own.
 
-The key is the seed (64 bits). The counter is (sample, pair of channels, attempt, channel within the pair).
+The key is the seed (64 bits). The counter is (sample, pair of channels, attempt, channel within the pair). Pairs from 2^31
+on are the uniform numbers that decide which sensors report.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ W0, W1 = uint64(0x9E3779B9), uint64(0xBB67AE85)  # what the key grows by in each
 LOW, HALF = uint64(0xFFFFFFFF), uint64(32)
 BYTE, SIGN, MANTISSA = uint64(0xFF), uint64(8), uint64(12)  # layer, sign and 52-bit abscissa of a word
 DROP, UNIT = uint64(11), 2.0**-53  # a word as a number in [0, 1)
+APART = uint64(2**31)  # pairs of channels from here on are no noise
 
 TAIL = 3.6541528853610088  # where the lowest layer ends and the tail begins
 AREA = TAIL * math.exp(-0.5 * TAIL**2) + math.sqrt(math.pi / 2) * math.erfc(TAIL / math.sqrt(2))  # of each layer
@@ -123,3 +125,10 @@ def fill(seed, start, samples, used, words, z):
                     z[s, j + which] = np.float64(np.int64(whole)) * WIDTH[layer] * SIDE[(word >> SIGN) & uint64(1)]
                 else:
                     z[s, j + which] = _missed(word, uint64(start + s) & LOW, uint64(pair), uint64(which), k0, k1)
+
+
+@numba.njit(error_model="numpy")
+def uniform(seed, sample, channel):
+    """A number in [0, 1) for a sample and a channel, apart from all noise."""
+    a, b, _, _ = philox(uint64(sample) & LOW, APART + uint64(channel), uint64(0), uint64(0), seed & LOW, seed >> HALF)
+    return np.float64((a | (b << HALF)) >> DROP) * UNIT

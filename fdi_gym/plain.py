@@ -18,11 +18,8 @@ _NUMBER = Annotated[int, Meta(ge=1 - 2**63, le=2**63 - 1)] | Annotated[float, Me
 _LEAF = str | bool | None | _NUMBER
 _INNER = _LEAF | list[_LEAF] | dict[str, _LEAF]
 
-
-class _Usual(msgspec.Struct):
-    """What the usual dict holds, for msgspec to copy: no deeper than this, no numbers at the edge of what there are."""
-
-    value: dict[str, _LEAF | list[_INNER] | dict[str, _INNER]]
+# What the usual dict holds, for msgspec to copy: no deeper than this, no numbers at the edge of what there are
+UsualDict = dict[str, _LEAF | list[_INNER] | dict[str, _INNER]]
 
 
 class _NotPlain(ValueError):
@@ -43,7 +40,7 @@ def plain(value: Any, where: str) -> Any:
     """
     if type(value) is dict:
         try:
-            copy = msgspec.convert({"value": value}, _Usual).value
+            copy = msgspec.convert(value, UsualDict)
             if copy == value:  # msgspec also makes lists of sets
                 return copy
         except Exception:  # something else, which the search below names, or takes

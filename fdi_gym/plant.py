@@ -18,12 +18,9 @@ from fdi_gym.checks import check_declaration, check_scenario, twice, unknown
 from fdi_gym.data_sheet import FaultMode, Kernels, Label, Signal, squared_error
 from fdi_gym.faults import FaultProcess, FaultScenario
 from fdi_gym.model import Array
+from fdi_gym.model import NotApplicableError as NotApplicableError
 from fdi_gym.shapes import OPEN, Shapes
 from fdi_gym.truth import Truth
-
-
-class NotApplicableError(ValueError):
-    """A method's word that it cannot run on a plant, with the reason (no unknown input, rank condition)."""
 
 
 def _no_rows(scenario: FaultScenario) -> Array:
@@ -75,7 +72,7 @@ class Plant(Truth):
         dt: Sample time [s].
         substeps: Runge-Kutta steps per sample; 0 for a discrete plant, whose dynamics kernel gives the next state.
         linear: The dynamics are linear in x, and bilinear in (u, theta).
-        kernels: The compiled equations.
+        kernels: The compiled equations; None where only channels are known: no model-based method runs.
         states, outputs, commands, known, disturbances: Data sheets of the vectors, in order.
         theta: Data sheet of the fault parameter; `nominal` is the healthy value.
         estimated: Data sheet of what the identification task asks for. Default: theta itself.
@@ -88,6 +85,10 @@ class Plant(Truth):
         c0: Initial state of the controller.
         q: Parameters of the controller.
         true_feedback: The controller gets the sensors' values before their noise is added; diagnosers never do.
+        healthy_feedback: The controller gets what healthy sensors would say, each at every sample.
+        simultaneous: Any of its modes may act at once, in sets for which there is no label (`fdi_gym.simultaneous`).
+        bare: Of a plant whose sensors may fail (`fdi_gym.sensors`): the same without.
+        regular: Of a plant whose sensors leave samples out: the same with sensors that report at every one.
         physical: Maps a scenario's physical parameters to the vector p; of {} it gives the nominal model.
         perturb: Draws physical parameters at a level of mismatch: perturb(rng, level) -> dict, or None if it has none.
         reference: Maps a scenario to the exogenous reference rows (steps + 1, n_r). Of a row that stays the same,
@@ -111,7 +112,7 @@ class Plant(Truth):
     description: str
     dt: float
     substeps: int
-    kernels: Kernels
+    kernels: Kernels | None
     states: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
     commands: tuple[Signal, ...]
@@ -128,6 +129,10 @@ class Plant(Truth):
     c0: Array = field(default_factory=lambda: np.zeros(0))
     q: Array = field(default_factory=lambda: np.zeros(0))
     true_feedback: bool = False
+    healthy_feedback: bool = False
+    simultaneous: bool = False
+    bare: Plant | None = None
+    regular: Plant | None = None
     physical: Callable[[Mapping[str, Any]], Array] = _no_change
     perturb: Callable[[np.random.Generator, float], Mapping[str, Any]] | None = None
     reference: Callable[[FaultScenario], Array] = _no_rows
@@ -160,7 +165,8 @@ class Plant(Truth):
         from fdi_gym.kernels import Sent
 
         state = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        state["kernels"] = Kernels(*(f if f is None else Sent(f) for f in self.kernels))
+        if self.kernels is not None:
+            state["kernels"] = Kernels(*(f if f is None else Sent(f) for f in self.kernels))
         return object.__new__, (Plant,), state
 
     def __eq__(self, other: object) -> bool:

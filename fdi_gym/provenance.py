@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import platformdirs
 
 from fdi_gym.diagnosis import diagnosers, find_diagnoser, make_diagnoser
@@ -74,11 +75,13 @@ def _use(name: str, plant: Plant, process: str, settings: Mapping[str, Any]) -> 
     """Build a method and show it one sample: whatever it reads, compiles or calibrates is read, compiled, calibrated."""
     if plant.id in plant_sources():
         load_plant(plant.id, **plant.options)  # for what its builder reads
-    scenario = draw(plant.process(process), 0)
-    flight = simulate(plant, [scenario])
+    scenarios, obs = None, np.array([[s.nominal for s in plant.observed]])
+    if plant.kernels is not None:
+        scenarios = [draw(plant.process(process), 0)]
+        obs = simulate(plant, scenarios).obs[:, 0]
     with blamed(name):
-        diagnoser = make_diagnoser(name, plant, process=process, scenarios=[scenario], **settings)
-        diagnoser.update(diagnoser.init(1), flight.obs[:, 0])
+        diagnoser = make_diagnoser(name, plant, process=process, scenarios=scenarios, **settings)
+        diagnoser.update(diagnoser.init(1), obs)
 
 
 def _digest(files: Mapping[str, Path], by_name: bool = True) -> str:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -32,7 +32,7 @@ from fdi_gym.files import (
 from fdi_gym.metrics import Outcome, check_outcomes
 from fdi_gym.names import check_diagnoser_name, check_name, file_name
 from fdi_gym.plant import Plant
-from fdi_gym.suite import Suite
+from fdi_gym.suite import AnySuite
 
 LARGEST = 2**20  # bytes of a row's file
 MADE = "made.json"
@@ -75,6 +75,15 @@ class Row(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         """The row as a reader will see it, with its digest."""
         row = msgspec.json.decode(msgspec.json.encode(self), type=Row)
         return msgspec.structs.replace(row, sha256=row.content_sha256())
+
+    def changed(self, digests: Mapping[str, str]) -> list[str]:
+        """Which of the digests of what made it are others than these, by name."""
+        mine = {k: v for k, v in self.digests.items() if k != "outcomes"}
+        return sorted(k for k in {*mine, *digests} if mine.get(k) != digests.get(k))
+
+    def made_by(self, digests: Mapping[str, str]) -> Row:
+        """The same row with these digests of what made it."""
+        return msgspec.structs.replace(self, digests={"outcomes": self.digests["outcomes"], **digests}).sealed()
 
 
 class Made(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -167,13 +176,16 @@ def row_files(folder: Path) -> Iterator[Path]:
     return (path for path in sorted(folder.glob("*.json")) if path.name != MADE)
 
 
-def check_writable(results: Path, suite: Suite, rows: Mapping[str, Mapping[str, str]], replace: bool = False) -> None:
+def check_writable(
+    results: Path, suite: AnySuite, names: Iterable[str], digests: Callable[[str], Mapping[str, str]], replace: bool = False
+) -> None:
     """Make sure, before anything runs, that rows can be written and nothing would be lost.
 
     Args:
         results: Folder of all rows.
         suite: The suite.
-        rows: For each diagnoser the digests of what will make its row.
+        names: Diagnosers whose rows will be written.
+        digests: Gives the digests of what will make a diagnoser's row; asked where a row is there that may not go.
         replace: Rows of the same suite that something else has made may go.
 
     Raises:
@@ -190,7 +202,7 @@ def check_writable(results: Path, suite: Suite, rows: Mapping[str, Mapping[str, 
         raise ValueError(f"cannot write results to {folder}: {error.strerror or error}") from error
     sweep(folder)
     read_made(folder)
-    for name, digests in rows.items():
+    for name in names:
         path = row_path(results, suite.name, name)
         if not path.exists():
             continue
@@ -200,14 +212,14 @@ def check_writable(results: Path, suite: Suite, rows: Mapping[str, Mapping[str, 
                 f"{path} is from another version of {suite.name} "
                 f"({old.suite_sha256[:12]}, here is {suite.sha256[:12]}); move it away first"
             )
-        changed = sorted(k for k in {*old.digests, *digests} - {"outcomes"} if old.digests.get(k) != digests.get(k))
+        changed = [] if replace else old.changed(digests(name))
         if (changed or old.diagnoser != name) and not replace:
             raise ValueError(
                 f"{path} was made by another {' and '.join(changed) or 'diagnoser'}; move it away, or --replace"
             )
 
 
-def write_rows(results: Path, suite: Suite, evaluated: Mapping[str, Evaluated]) -> None:
+def write_rows(results: Path, suite: AnySuite, evaluated: Mapping[str, Evaluated]) -> None:
     """Write rows and their outcomes, and how they were made into the file beside them.
 
     Raises:

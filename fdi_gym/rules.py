@@ -23,6 +23,7 @@ from fdi_gym.plant import Array, Plant, Signal
 from fdi_gym.tasks import TASKS
 
 UNITS = ("physical", "scaled")
+SETS = ("modes", "identification")  # tasks that do not need a label
 
 # Samples that are flown ahead of the agent: few after a reset, since an episode may be short, and twice as many each time.
 # `python benchmarks/engine.py --chunks` measures what the two cost.
@@ -94,6 +95,16 @@ def plain(value: Any) -> Any:
     return value
 
 
+class Readings(Box):
+    """Observations: numbers between bounds, or NaN where a sensor did not report."""
+
+    def contains(self, x: Any) -> bool:
+        """Whether x is one."""
+        if isinstance(x, np.ndarray) and x.shape == self.shape and np.isnan(x).any():
+            x = np.where(np.isnan(x), self.low, x)
+        return super().contains(x)
+
+
 class Specified:
     """An environment whose spec survives JSON, whatever it was made with."""
 
@@ -132,6 +143,10 @@ class Rules:
         if isinstance(plant, Plant) and options:
             raise ValueError(f"{plant.id} is built already: the options {', '.join(options)} come too late")
         self.plant = load_plant(plant, **options) if isinstance(plant, str) else plant
+        if self.plant.simultaneous and task not in SETS:
+            raise ValueError(
+                f"where faults act at once, no label says which: the task is one of {', '.join(SETS)}, not {task!r}"
+            )
         self.mismatch = self._checked_mismatch(mismatch)
         self.task = TASKS[task](self.plant, units == "scaled")
         if scenario is not None and (process is not None or mismatch is not None):
@@ -152,7 +167,7 @@ class Rules:
             high = np.nextafter(np.float32((high - self._nominal) / self._scale), np.float32(np.inf))
         if self.period > 1:
             low, high = np.tile(low, (self.period, 1)), np.tile(high, (self.period, 1))
-        self.observation_space = Box(low, high, dtype=dtype)
+        self.observation_space = Readings(low, high, dtype=dtype)
         self.action_space = self.task.space
 
     def _checked_mismatch(self, mismatch: Any) -> float | None:

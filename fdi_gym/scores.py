@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from fdi_gym.intervals import balanced_interval, recalls, resamples, strata
-from fdi_gym.metrics import BANDS, PHASES, Outcome
+from fdi_gym.metrics import BANDS, PHASES, Onset, Outcome
 from fdi_gym.plant import Array
 
 BOOTSTRAP = 1000
@@ -53,6 +53,15 @@ def restricted_mean(curve: Sequence[tuple[int, float]], horizon: int, dt: float)
             break
         area, since, left = area + left * (time - since), time, after
     return (area + left * (horizon - since)) * dt
+
+
+def asked(onsets: Iterable[Onset], kind: str) -> list[Onset]:
+    """The faults whose delay counts: of "detection", those that begin from healthy and under no alarm; of "isolation",
+    those whose label was not declared already.
+    """
+    if kind == "detection":
+        return [onset for onset in onsets if onset.fresh and not onset.alarmed]
+    return [onset for onset in onsets if not onset.labelled]
 
 
 def answers(outcomes: Sequence[Outcome], labels: int, kind: str) -> Array:
@@ -112,9 +121,9 @@ def _detection(outcomes: Sequence[Outcome], stratum: Array, dt: float) -> dict[s
     rates = (drawn @ alarms)[exposure > 0] / exposure[exposure > 0]
     onsets = [onset for flight in outcomes for onset in flight.onsets]
     fresh = [onset for onset in onsets if onset.fresh]
-    asked, wanted = [o for o in fresh if not o.alarmed], [o for o in onsets if not o.labelled]
+    timed, wanted = asked(onsets, "detection"), asked(onsets, "isolation")
     horizons = [int(np.median([o.length for o in some])) if some else 0 for some in (fresh, onsets)]
-    detected = survival([o.detection for o in asked], [o.length for o in asked])
+    detected = survival([o.detection for o in timed], [o.length for o in timed])
     isolated = survival([o.isolation for o in wanted], [o.length for o in wanted])
     return {
         "balanced_accuracy": score,
@@ -122,10 +131,10 @@ def _detection(outcomes: Sequence[Outcome], stratum: Array, dt: float) -> dict[s
         "false_alarms_per_hour": float(alarms.sum() / hours) if hours else None,
         "false_alarms_per_hour_interval": [float(v) for v in np.percentile(rates, [2.5, 97.5])] if len(rates) else None,
         "healthy_share_under_alarm": float(below / steps.sum()) if hours else None,
-        "begun_under_alarm_rate": (len(fresh) - len(asked)) / len(fresh) if fresh else None,
-        "missed_rate": sum(o.detection is None for o in asked) / len(asked) if asked else None,
+        "begun_under_alarm_rate": (len(fresh) - len(timed)) / len(fresh) if fresh else None,
+        "missed_rate": sum(o.detection is None for o in timed) / len(timed) if timed else None,
         "delay_quartiles": delay_quartiles(detected, dt),
-        "delay_restricted_mean": restricted_mean(detected, horizons[0], dt) if asked else None,
+        "delay_restricted_mean": restricted_mean(detected, horizons[0], dt) if timed else None,
         "delay_horizon": horizons[0] * dt,
         "isolation_delay_quartiles": delay_quartiles(isolated, dt),
         "isolation_delay_restricted_mean": restricted_mean(isolated, horizons[1], dt) if wanted else None,
@@ -161,13 +170,14 @@ def _scenario(outcomes: Sequence[Outcome], dt: float) -> dict[str, Any]:
     said = [flight.declaration for flight in outcomes]
     found = [f for one in said for f in one.found]
     onsets = np.abs([f.onset for f in found]) * dt
+    sizes = np.abs([f.size for f in found if f.size is not None])
     return {
         "worth": float(np.mean([one.worth for one in said])),
         "exact": float(np.mean([one.exact for one in said])),
         "found": float(len(found) / modes) if (modes := sum(one.modes for one in said)) else None,
         "onset_error_quartiles": np.quantile(onsets, (0.25, 0.5, 0.75)).tolist() if found else None,
         "overlap": float(np.mean([f.overlap for f in found])) if found else None,
-        "size_error": float(np.median(np.abs([f.size for f in found]))) if found else None,
+        "size_error": float(np.median(sizes)) if sizes.size else None,
     }
 
 

@@ -1,25 +1,31 @@
 """Suites: frozen JSON files that say which environment, which fault process and which seeds.
 
-A suite's content hash travels with every result.
+A suite's content hash travels with every result. Suites of recorded flights (`fdi_gym.recordings.suite`) are loaded by the
+same names. Packages bring theirs by the entry-point group "fdi_gym.suites": a package in whose folder the files are.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import msgspec
 import numpy as np
 
 from fdi_gym.diagnosis import find_diagnoser
 from fdi_gym.discovery import load_plant, plant_sources
+from fdi_gym.engine import Record, simulate
 from fdi_gym.faults import MAX_STEPS, FaultScenario, draw
 from fdi_gym.files import RefusedError, digest, pretty, read_json, write_whole
 from fdi_gym.names import blame, check_diagnoser_name, check_name, find_function, find_module, unknown
+from fdi_gym.options import Options
 from fdi_gym.plant import Plant
+from fdi_gym.recordings.suite import RecordedSuite, read_recorded
 
 _PACKAGED = Path(__file__).parent / "suites"
 _CHECKOUT = Path(__file__).parent.parent / "leaderboards" / "suites"
@@ -56,12 +62,12 @@ def checked_options(plant_id: str, options: Mapping[str, Any], *, typed: bool = 
     if plant_id not in sources:
         raise unknown("plant", plant_id, sources)
     build = find_function("plant", sources[plant_id].builder)
-    signature = inspect.signature(build, eval_str=True).parameters
+    signature, every = inspect.signature(build, eval_str=True).parameters, get_type_hints(Options)
     found = {}
     for name, value in options.items():
-        if name not in signature:
-            raise unknown(f"option of {plant_id}", name, signature)
-        kind = signature[name].annotation
+        if name not in signature and name not in every:
+            raise unknown(f"option of {plant_id}", name, [*signature, *every])
+        kind = signature[name].annotation if name in signature else every[name]
         kind = type(signature[name].default) if kind is inspect.Parameter.empty else kind
         try:
             found[name] = msgspec.convert(value, kind, strict=typed)
@@ -205,6 +211,8 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise ValueError(f"{self.name} is of {env_id!r}; this {self.plant} is {plant.env_id}")
         if self.mismatch is not None and plant.perturb is None:
             raise ValueError(f"{self.plant} has no mismatch")
+        if plant.simultaneous:
+            raise ValueError("a suite scores labels; sets of modes are scored by fdi_gym.simultaneous.scores")
         return plant
 
     def scenarios(self, plant: Plant, episodes: Sequence[int]) -> list[FaultScenario]:
@@ -220,6 +228,10 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             found.append(scenario if self.steps is None else scenario.replace(steps=min(scenario.steps, self.steps)))
         return found
 
+    def record(self, plant: Plant, episodes: Sequence[int]) -> Record:
+        """These flights, flown."""
+        return simulate(plant, self.scenarios(plant, episodes))
+
     def check_scenarios(self, plant: Plant) -> None:
         """Make sure that this version draws what the suite was frozen with.
 
@@ -230,25 +242,55 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise ValueError(f"{self.name}: this version draws other scenarios than the suite was frozen with")
 
 
+AnySuite = Suite | RecordedSuite
+
+
+def suite_files() -> dict[str, Path]:
+    """The files of the suites that are installed, by name: those of this package, then those of others."""
+    found: dict[str, Path] = {}
+    for folder in (SUITES, *(_folder(entry_point.value) for entry_point in entry_points(group="fdi_gym.suites"))):
+        for path in sorted(folder.glob("*.json")) if folder is not None else ():
+            found.setdefault(path.stem, path)
+    return found
+
+
+def _folder(module: str) -> Path | None:
+    """Where a package or module lies; None where there is none."""
+    try:
+        spec = importlib.util.find_spec(module)
+    except Exception:  # whatever a package does when it is imported
+        return None
+    place = spec and (next(iter(spec.submodule_search_locations or ()), None) or (spec.origin and Path(spec.origin).parent))
+    return Path(place) if place else None
+
+
 def suite_names() -> list[str]:
-    """Names of the suites that ship with the package."""
-    return sorted(path.stem for path in SUITES.glob("*.json"))
+    """Names of the suites that are installed."""
+    return sorted(suite_files())
 
 
-def load_suite(name: str) -> Suite:
-    """A suite by name, or from a path that ends in ".json".
+def load_suite(name: str) -> AnySuite:
+    """A suite by name, "module:name" where its file lies beside a module's, or from a path that ends in ".json".
 
     Raises:
         ValueError: No such suite; `RefusedError` where its file is none, or was edited after it was frozen.
     """
+    module, _, within = name.rpartition(":")
+    known = suite_files()
     if name.endswith(".json"):
         path = Path(name)
         if not path.is_file():
             raise ValueError(f"there is no suite {name}")
-    elif name not in suite_names():
-        raise unknown("suite", name, suite_names())
+    elif module and (folder := _folder(module)) is not None:
+        path = folder / f"{check_name('suite', within)}.json"
+        if not path.is_file():
+            raise ValueError(f"there is no suite {within!r} in {folder}")
+    elif name not in known:
+        raise unknown("suite", name, sorted(known))
     else:
-        path = SUITES / f"{name}.json"
+        path = known[name]
+    if "flights" in read_json(path, dict[str, msgspec.Raw], "suite"):
+        return read_recorded(path)
     suite = read_json(path, Suite, "suite", LARGEST)
     if suite.name != path.stem:
         raise RefusedError(f"{path} holds a suite that is called {suite.name}")

@@ -255,12 +255,15 @@ def _figures(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield path, value
 
 
-def comma_separated(rows: Sequence[Row], timing: Mapping[str, float]) -> str:
-    """All figures of rows but their confusion matrices, as CSV in full digits; a column is named by the figure's place."""
+def comma_separated(rows: Sequence[Row], timing: Mapping[tuple[str, str], float]) -> str:
+    """All figures of rows but their confusion matrices, as CSV in full digits; a column is named by the figure's place.
+
+    Times are by suite and diagnoser.
+    """
     lines = []
     for row in rows:
         figures = {name: value for name, value in _figures(row.metrics) if ".confusion." not in name}
-        known = {"knows": knows(row), "microseconds": timing.get(row.diagnoser)}
+        known = {"knows": knows(row), "microseconds": timing.get((row.suite, row.diagnoser))}
         lines.append({"suite": row.suite, "diagnoser": row.diagnoser, **known, **figures})
     text = io.StringIO()
     writer = csv.DictWriter(text, list(dict.fromkeys(key for line in lines for key in line)), lineterminator="\n")

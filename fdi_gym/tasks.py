@@ -1,6 +1,7 @@
 """The tasks: what an action says, when it is judged, and what it is worth. One class each.
 
 - `isolation`: which fault acts, as a label;
+- `modes`: which of the fault modes act, each for itself;
 - `identification`: the estimated quantity;
 - `diagnosis`: both in one action;
 - `scenario`: one declaration for the flight, made with its last action: which faults it had, when, and how large.
@@ -13,7 +14,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import numpy as np
-from gymnasium.spaces import Box, Discrete, Space
+from gymnasium.spaces import Box, Discrete, MultiBinary, Space
 
 from fdi_gym.declaration import COLUMNS, END, ONSET, PRESENT, SIZE, worth
 from fdi_gym.plant import Array, Plant
@@ -138,6 +139,30 @@ class Isolation(Task):
         return self.plant.isolation_reward[label, answer]  # type: ignore[index]
 
 
+class Modes(Task):
+    """`MultiBinary(modes)`: for each fault mode in turn, whether it acted over [k - 1, k).
+
+    Worth the share of the modes that are answered right.
+    """
+
+    name = "modes"
+
+    def __init__(self, plant: Plant, scaled: bool):
+        super().__init__(plant, scaled)
+        self.space = MultiBinary(len(plant.modes))
+
+    def check(self, action: Any, shape: tuple[int, ...]) -> Array:
+        """As `Task.check`."""
+        value, wanted = _array(action), (*shape, len(self.plant.modes))
+        if value.shape != wanted or value.dtype.kind not in "iub" or not ((value == 0) | (value == 1)).all():
+            raise ValueError(f"the action is 0 or 1 for each fault mode, shape {wanted}, not {action!r}")
+        return value.astype(bool)
+
+    def reward(self, answer: Array, label: Any, target: Array) -> Any:
+        """As `Task.reward`."""
+        return (answer == self.plant.modes_of(label)).mean(axis=-1)
+
+
 class Identification(_Boxed):
     """`Box` over the estimated quantity."""
 
@@ -223,4 +248,4 @@ class Scenario(_Boxed):
         return value
 
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (Isolation, Identification, Diagnosis, Scenario)}
+TASKS: dict[str, type[Task]] = {task.name: task for task in (Isolation, Modes, Identification, Diagnosis, Scenario)}

@@ -7,11 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi_gym.faults import Abrupt, FaultScenario, Hold, Incipient, Intermittent, Samples, Square
+from fdi_gym.faults import Abrupt, FaultScenario, Hold, Incipient, Intermittent, Ramp, Samples, Square
 
 
 class ThetaTable(NamedTuple):
-    """theta over a flight: on step k, tau seconds after sample k, entry j is a + b exp(-g tau); holds own theirs.
+    """theta over a flight, entry by entry: on step k, tau seconds after sample k, it is a + b exp(-g tau).
+
+    Where g < 0 it is a + b tau. Holds own their entries.
 
     a, b, g: (K + 1, n_theta). holds: (n_holds, 5) int64, rows (entry, first step, end step, command index, lag).
     """
@@ -45,6 +47,11 @@ def theta_table(
                     a[window, j] = value
                     b[window, j] = (nominal[j] - value) * np.exp(-rate * since * dt)
                     g[window, j] = rate
+                case Ramp(value=value, duration=duration):
+                    share, then = (np.minimum(s * dt / duration, 1.0) for s in (since, since + 1))
+                    a[window, j] = nominal[j] + (value - nominal[j]) * share
+                    b[window, j] = (value - nominal[j]) * (then - share) / dt
+                    g[window, j] = np.where(then > share, -1.0, 0.0)
                 case Intermittent(value=value, period=period, duty=duty):
                     on = (since * dt / period + 1e-9) % 1.0 < duty
                     a[window, j] = np.where(on, value, nominal[j])

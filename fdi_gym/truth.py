@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi_gym.data_sheet import Label
+from fdi_gym.data_sheet import FaultMode, Label
 from fdi_gym.faults import FaultProcess, FaultScenario, draw
 from fdi_gym.model import Array, Model, contiguous
 from fdi_gym.theta import ThetaTable, theta_table
@@ -32,6 +32,8 @@ class Truth(Model):
 
     id: str
     labels: tuple[Label, ...]
+    modes: tuple[FaultMode, ...]
+    simultaneous: bool
     processes: Mapping[str, FaultProcess]
     reference: Callable[[FaultScenario], Array]
     disturbance: Callable[[FaultScenario], Array] | None
@@ -47,10 +49,19 @@ class Truth(Model):
             ValueError: No label says so; the message lists those that exist.
         """
         index = self._label_index.get(modes)
+        if index is None and self.simultaneous:
+            return len(self.labels) + sum(1 << i for i, mode in enumerate(self.modes) if mode.name in modes)
         if index is None:
             names = ", ".join(label.name for label in self.labels)
             raise ValueError(f"{self.id} has no label for {sorted(modes)} at once; it has {names}")
         return index
+
+    def modes_of(self, label: Array) -> Array:
+        """The set of modes (..., modes) that labels (...) say, or the numbers of sets without one."""
+        label, bits = np.asarray(label), np.arange(len(self.modes))
+        said = np.array([[mode.name in of.modes for mode in self.modes] for of in self.labels])
+        beyond = (np.maximum(label - len(self.labels), 0)[..., None] >> bits) & 1
+        return np.where((label < len(self.labels))[..., None], said[np.minimum(label, len(self.labels) - 1)], beyond > 0)
 
     def label_intervals(self, scenario: FaultScenario) -> Iterator[tuple[int, int, frozenset[str]]]:
         """The flight's intervals (first step, end step, active modes) between the changes of the set of active modes."""

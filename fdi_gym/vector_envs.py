@@ -12,7 +12,8 @@ from gymnasium.vector.utils import batch_space
 from fdi_gym import rules
 from fdi_gym.engine import Record, advance, simulate
 from fdi_gym.faults import FaultScenario
-from fdi_gym.flights import Flights
+from fdi_gym.flights import Flights, Prepared
+from fdi_gym.next_flights import NextFlights
 from fdi_gym.plant import Array, Plant
 from fdi_gym.rules import Rules, Specified, ahead, checked_mask, checked_seeds, whole
 
@@ -76,6 +77,7 @@ class FDIVectorEnv(Specified, VectorEnv):
         self._over = np.ones(num_envs, dtype=bool)
         self._waits, self._fresh = True, True  # whether any episode is over, and whether any has just begun
         self._all = np.arange(num_envs)
+        self._next = NextFlights(self._prepared)
         self._declared: list[list[tuple[int, Array]]] = [[] for _ in range(num_envs)]
         self._records: dict[int, Record] = {}
         self._canvas: Any = None
@@ -121,13 +123,16 @@ class FDIVectorEnv(Specified, VectorEnv):
 
     def _begin(self, slots: Array, seeds: list[int | None], replay: FaultScenario | None = None) -> None:
         """Begin an episode in each of these environments, at the row where all are."""
+        prepared: list[Prepared | None] = []
         for i in slots.tolist():
             seed = seeds[i]
             if seed is None:
                 episode_seed = int(self._rng(i).integers(2**63))
             else:
                 episode_seed, self._seeds[i], self._rngs[i] = seed, seed, None
-            self.scenarios[i] = self._rules.draw(episode_seed) if replay is None else replay
+            flight = self._next.take(i, episode_seed)
+            prepared.append(flight if replay is None else None)
+            self.scenarios[i] = replay or (flight.scenario if flight else self._rules.draw(episode_seed))
             self._declared[i] = []
             self._records.pop(i, None)
         scenarios = [s for i in slots if (s := self.scenarios[i]) is not None]
@@ -139,7 +144,9 @@ class FDIVectorEnv(Specified, VectorEnv):
                 np.zeros((*self._buffer.label.shape, len(self.plant.estimated)))  # fmt: skip
             self._row = np.zeros(self.num_envs, np.int64)
         else:
-            self._flights.begin(slots, scenarios)
+            self._flights.put(
+                slots, [flight or self._flights.prepare(s) for flight, s in zip(prepared, scenarios, strict=True)]
+            )
         if slots.size == self.num_envs:
             self._now, self._ahead = self._rules.period - 1, ahead(0, self._rules.period)
             self._filled = self._now + 1 + self._ahead
@@ -166,6 +173,14 @@ class FDIVectorEnv(Specified, VectorEnv):
         self._now, self._ahead = m - 1, ahead(self._ahead, m)
         self._filled = m + self._ahead
         self._fly(m, self._all)
+        if self._mode is not AutoresetMode.DISABLED:
+            under_way = np.flatnonzero(~self._over)
+            self._next.plan(under_way, (self._flights.length - self._k)[under_way] // m)  # type: ignore[union-attr]
+
+    def _prepared(self, seed: int) -> Prepared:
+        """The flight of an episode's seed."""
+        assert self._flights is not None
+        return self._flights.prepare(self._rules.draw(seed))
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Step every environment; those that ended are treated as the autoreset mode says.
@@ -192,6 +207,7 @@ class FDIVectorEnv(Specified, VectorEnv):
                 self._declared[i].append((int(k[i]), checked[i]))
         if self._now + 1 == self._filled:
             self._fly_all()
+        self._next.prepare(self._rng)
         period = self._rules.period
         self._k = np.minimum(k + period, flights.length)
         if waits:

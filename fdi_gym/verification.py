@@ -2,27 +2,38 @@
 
 What a row says is compared with its suite, its outcomes and the code that is here; then some of its episodes are run
 again. Which ones is drawn by whoever verifies, so that nobody can know beforehand which others to make up.
+
+Sources may change without a change of outcomes. A row is then still what the code gives but not made of what it says:
+renewing it writes the digests of what is here into it, and into a row that the code no longer gives nothing.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import joblib
 import msgspec
 import numpy as np
 
 from fdi_gym.diagnosis import diagnosers
-from fdi_gym.evaluation import diagnose, digests_of, settings_of
-from fdi_gym.files import RefusedError
+from fdi_gym.evaluation import check_jobs, diagnose, digests_of, settings_of
+from fdi_gym.files import RefusedError, pretty, write_whole
 from fdi_gym.metrics import Outcome
 from fdi_gym.names import unknown
 from fdi_gym.plant import Plant
 from fdi_gym.row import Row, read_outcomes, read_row
 from fdi_gym.scores import summarise
-from fdi_gym.suite import Suite, load_suite
+from fdi_gym.suite import AnySuite, load_suite
+
+
+class Verified(NamedTuple):
+    """A row that holds: which of its episodes were run again, and which of its digests were made anew."""
+
+    episodes: list[int]
+    renewed: list[str]
 
 
 def _differences(said: Any, found: Any, path: str, tolerance: float = 1e-9) -> Iterator[str]:
@@ -48,7 +59,7 @@ def _compare(row: Row, said: Any, found: Any, path: str, tolerance: float = 1e-9
         raise RefusedError(f"{row.suite}/{row.diagnoser}: {'; '.join(text[:300] for text in differences[:5])}")
 
 
-def check_row(row: Row, outcomes: Sequence[Outcome], suite: Suite, plant: Plant) -> None:
+def check_row(row: Row, outcomes: Sequence[Outcome], suite: AnySuite, plant: Plant) -> None:
     """Compare a row with its suite and its outcomes: its figures. Nothing is run or imported.
 
     Raises:
@@ -65,18 +76,28 @@ def check_row(row: Row, outcomes: Sequence[Outcome], suite: Suite, plant: Plant)
     _compare(row, row.metrics, found, "metrics")
 
 
-def check_made_by(row: Row, suite: Suite, plant: Plant) -> None:
-    """Compare a row with the code that is here: its settings, and the digests of what made it.
+def check_settings(row: Row, suite: AnySuite, plant: Plant) -> None:
+    """Compare a row with the settings that its diagnoser's builder gets here.
 
     Raises:
         RefusedError: They are others; they are named.
     """
     _compare(row, row.settings, settings_of(suite, plant, row.diagnoser), "settings")
-    digests = {k: v for k, v in row.digests.items() if k != "outcomes"}
-    _compare(row, digests, digests_of(suite, plant, row.diagnoser), "digests")
 
 
-def check_episodes(row: Row, outcomes: Sequence[Outcome], suite: Suite, plant: Plant, episodes: Sequence[int]) -> None:
+def check_made_by(row: Row, digests: Mapping[str, str]) -> None:
+    """Compare a row with the digests of what would make it here.
+
+    Raises:
+        RefusedError: They are others; they are named.
+    """
+    try:
+        _compare(row, {k: v for k, v in row.digests.items() if k != "outcomes"}, dict(digests), "digests")
+    except RefusedError as error:
+        raise RefusedError(f"{error} (renew it, if the code still gives the same outcomes)") from None
+
+
+def check_episodes(row: Row, outcomes: Sequence[Outcome], suite: AnySuite, plant: Plant, episodes: Sequence[int]) -> None:
     """Run episodes again and compare their outcomes.
 
     Raises:
@@ -84,13 +105,35 @@ def check_episodes(row: Row, outcomes: Sequence[Outcome], suite: Suite, plant: P
     """
     block = diagnose(suite, plant, row.diagnoser, episodes)
     for i, again in zip(episodes, block.outcomes, strict=True):
-        _compare(row, msgspec.json.decode(msgspec.json.encode(outcomes[i])), again, f"outcomes[{i}]", tolerance=1e-6)
+        said = msgspec.json.decode(msgspec.json.encode(outcomes[i]))
+        try:
+            _compare(row, said, again, f"outcomes[{i}]", tolerance=1e-6)
+        except RefusedError as error:
+            raise RefusedError(f"the code no longer gives this row; {error}") from None
+
+
+def check_drawing(share: float, seed: int | None) -> None:
+    """Check what draws the episodes that are run again.
+
+    Raises:
+        ValueError: The share or seed is out of range.
+    """
+    if not 0 < share <= 1:
+        raise ValueError(f"share is above 0 and up to 1, not {share}")
+    if seed is not None and seed < 0:
+        raise ValueError(f"seed is 0 or more, not {seed}")
 
 
 def verify(
-    path: Path, share: float = 0.1, *, seed: int | None = None, suite: str = "", trust: Collection[str] = ()
-) -> list[int]:
-    """Check everything in a row, and run a share of its episodes again; returns which.
+    path: Path,
+    share: float = 0.1,
+    *,
+    seed: int | None = None,
+    suite: str = "",
+    trust: Collection[str] = (),
+    renew: bool = False,
+) -> Verified:
+    """Check everything in a row, and run a share of its episodes again.
 
     Args:
         path: The row's file; its outcomes lie beside it.
@@ -98,14 +141,14 @@ def verify(
         seed: Draws which ones; None for the system's randomness.
         suite: Name or path of the suite; default: the one of this package that the row names.
         trust: Diagnosers of the form "module:function" that may be imported; no other module that a row names is.
+        renew: Where other sources, data, belief or calibration are here than those that made the row, and all else holds,
+            write their digests into it. Its outcomes, figures and settings stay as they are; so does a row that fails.
 
     Raises:
         ValueError: The share or seed is out of range; `RefusedError` where the row fails, in words.
+        OSError: The row cannot be written.
     """
-    if not 0 < share <= 1:
-        raise ValueError(f"share is above 0 and up to 1, not {share}")
-    if seed is not None and seed < 0:
-        raise ValueError(f"seed is 0 or more, not {seed}")
+    check_drawing(share, seed)
     row = read_row(path)
     if ":" in row.diagnoser and row.diagnoser not in trust:
         raise RefusedError(
@@ -117,9 +160,43 @@ def verify(
     plant = frozen.build()
     outcomes = read_outcomes(path, row, plant)
     check_row(row, outcomes, frozen, plant)
-    check_made_by(row, frozen, plant)
+    check_settings(row, frozen, plant)
+    digests = digests_of(frozen, plant, row.diagnoser)
+    if not renew:
+        check_made_by(row, digests)
     rng = np.random.default_rng(seed)
     count = min(frozen.episodes, max(1, math.ceil(share * frozen.episodes)))
     episodes = sorted(int(i) for i in rng.choice(frozen.episodes, count, replace=False))
     check_episodes(row, outcomes, frozen, plant, episodes)
-    return episodes
+    changed = row.changed(digests)
+    if changed:
+        write_whole(path, pretty(row.made_by(digests)))
+    return Verified(episodes, changed)
+
+
+def verify_all(
+    paths: Sequence[Path], share: float = 0.1, *, seed: int | None = None, jobs: int = 1, **options: Any
+) -> Iterator[tuple[Path, Verified | ValueError | OSError]]:
+    """Verify many rows, in parallel: in their order each with what was found, or the error that refuses it.
+
+    Args:
+        paths: The rows' files.
+        share, seed: As for `verify`.
+        jobs: Worker processes, -1 for one per core.
+        options: The further ones of `verify`.
+
+    Raises:
+        ValueError: The share, the seed or the number of jobs is out of range.
+    """
+    check_drawing(share, seed)
+    check_jobs(jobs)
+    calls = (joblib.delayed(_tried)(path, share, {"seed": seed, **options}) for path in paths)
+    parallel: Any = joblib.Parallel(n_jobs=jobs if len(paths) > 1 else 1, return_as="generator")
+    return zip(paths, parallel(calls), strict=True)
+
+
+def _tried(path: Path, share: float, options: Mapping[str, Any]) -> Verified | ValueError | OSError:
+    try:
+        return verify(path, share, **options)
+    except (ValueError, OSError) as error:
+        return error

@@ -1,4 +1,4 @@
-"""Shared by all tests: the plants and diagnosers there are, and the fifth plant of the examples."""
+"""Shared by all tests: the plants and diagnosers there are, and the plant of the examples."""
 
 from __future__ import annotations
 

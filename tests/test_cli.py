@@ -12,7 +12,7 @@ import time
 import pytest
 from conftest import PLANTS, ROOT
 
-from fdi_gym import __version__, cli, suite
+from fdi_gym import __version__, cli, evaluation, suite
 from fdi_gym.diagnosis import broken_plugins, diagnosers, registry, trainers
 from fdi_gym.suite import Suite, freeze, load_suite, suite_names
 
@@ -179,6 +179,93 @@ def test_the_commands_of_the_examples_work(capsys, tmp_path, monkeypatch):
     assert load_suite(str(tmp_path / "motor.json")).env == "dc_motor:DCMotor-Faults-v0"
 
 
+# -- many suites
+
+
+@pytest.fixture
+def two(here, small, monkeypatch):
+    """A folder with two suites, which are all there are."""
+    folder = here / "suites"
+    folder.mkdir()
+    (folder / "small.json").write_bytes(small.read_bytes())
+    other = Suite(name="other", description="another", env="MissilePitch-Faults-v0", plant="MissilePitch", options={},
+                  process="standard", mismatch=None, seeds=[*range(300, 302)], settings={})  # fmt: skip
+    freeze(other, folder)
+    monkeypatch.setattr(suite, "SUITES", folder)
+    return here
+
+
+ALL = (
+    "evaluate",
+    "all",
+    "--diagnosers",
+    "null",
+    "random",
+    "two_stage_kf",
+    "--jobs",
+    "1",
+    "--work",
+    "work",
+    "--results",
+    "r",
+)
+
+
+def rows_in(folder):
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != "made.json"}
+
+
+def test_all_suites_are_evaluated_by_one_command(capsys, two):
+    code, out, err = said(capsys, *ALL, "--csv", "all.csv")
+    assert code == 0, err
+    lines = out.strip().splitlines()[-2:]
+    assert re.fullmatch(r"other: 2 rows in r/other, \d+ s", lines[0])
+    assert re.fullmatch(r"small: 3 rows in r/small, \d+ s", lines[1])
+    assert "other: two_stage_kf: not applicable" in err
+    assert len(rows_in(two / "r")) == 2 * 5
+    table = (two / "all.csv").read_text().splitlines()
+    assert [line.split(",")[0] for line in table[1:]] == ["other"] * 2 + ["small"] * 3
+    assert all(float(line.split(",")[table[0].split(",").index("microseconds")]) > 0 for line in table[1:])
+    before = rows_in(two / "r")
+    assert said(capsys, *ALL, "--replace")[0] == 0
+    assert rows_in(two / "r") == before
+    made = json.loads((two / "r" / "other" / "made.json").read_text())
+    assert made["null"]["command"] == "fdi-gym evaluate other --diagnosers null random"
+
+
+def test_a_killed_run_over_all_suites_goes_on_where_it_was(capsys, two, monkeypatch):
+    """Rows are written suite by suite, and no block is made twice."""
+    evaluate = evaluation.evaluate
+
+    def killed(asked, *arguments, **keywords):
+        if asked.name == "small":
+            raise KeyboardInterrupt
+        return evaluate(asked, *arguments, **keywords)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(evaluation, "evaluate", killed)
+        code, _, err = said(capsys, *ALL)
+    assert (code, err.count("goes on from what is finished")) == (130, 1)
+    first = rows_in(two / "r")
+    assert len(first) == 4
+    done = {path: path.stat().st_mtime_ns for path in (two / "work").rglob("block-*.json")}
+    assert len(done) == 2
+    assert said(capsys, *ALL)[0] == 0
+    assert {path: path.stat().st_mtime_ns for path in done} == done
+    assert first.items() <= rows_in(two / "r").items()
+    assert len(rows_in(two / "r")) == 10
+
+
+def test_what_is_wrong_with_one_of_many_suites_is_said_before_anything_runs(capsys, two):
+    some = ("--diagnosers", "null", "--jobs", "1", "--work", "work", "--results", "r")
+    assert "did you mean small?" in refused(capsys, "evaluate", "other", "smal", *some)
+    assert said(capsys, "evaluate", "small", *some)[0] == 0
+    (two / "r" / "small" / "null.json").write_text("mine")
+    assert "is not a row" in refused(capsys, "evaluate", "other", "small", *some, "--replace")
+    assert not list((two / "work").glob("other*"))
+    assert "evaluate a suite, or all; there are other, small" in refused(capsys, "evaluate")
+
+
 # -- freeze
 
 
@@ -285,7 +372,9 @@ def test_help_says_what_a_word_stands_for(capsys, command):
     assert code == 0
     assert not re.search(r"\bSTR\b", out)
     assert {"evaluate": "SUITE", "verify": "ROW", "leaderboard": "PATH", "list": "NAME", "freeze": "PLANT",
-            "train": "METHOD", "fit": "PLANT"}[command] in out  # fmt: skip
+            "train": "METHOD", "fit": "PLANT", "report": "SUITE", "plot": "SUITE",
+            "diagnose": "FLIGHT", "collect": "FOLDER", "export": "SUITE", "new": "FOLDER",
+            "check": "NAME"}[command] in out  # fmt: skip
 
 
 @pytest.mark.parametrize("arguments", [("list",), ("--help",), ("list", "B747Lateral"), ("list", "nothing")], ids=" ".join)
@@ -302,13 +391,17 @@ def test_a_closed_pipe_is_silent(arguments):
 
 def test_an_interruption_is_one_line_and_status_130(tmp_path, small):
     run = subprocess.Popen(
-        [*FDI_GYM, "evaluate", "b747-standard", "--diagnosers", "random", "--jobs", "2", "--work", str(tmp_path)],
+        [*FDI_GYM, "evaluate", "b747-standard", "--diagnosers", "random", "switching_bayes_bank", "--jobs", "2",
+         "--work", str(tmp_path)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True, cwd=tmp_path,
     )  # fmt: skip
     for _ in range(1200):
         if list(tmp_path.rglob("block-*.json")) or run.poll() is not None:
             break
         time.sleep(0.05)
+    time.sleep(
+        3
+    )  # both workers are at work on what takes long: one that still starts says in its own way that it was stopped
     os.killpg(run.pid, signal.SIGINT)
     _, err = run.communicate(timeout=60)
     assert run.returncode == 130, err

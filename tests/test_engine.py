@@ -18,6 +18,8 @@ from fdi_gym import closed_loop, noise
 from fdi_gym.engine import advance, no_noise, simulate, white_noise
 from fdi_gym.faults import Abrupt, Fault, Hold, Samples, draw
 from fdi_gym.flights import Chunk, Flights
+from fdi_gym.kernels import kernel
+from fdi_gym.testing import check_plant
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -150,6 +152,53 @@ def test_a_reference_of_another_width_is_refused_and_the_flights_go_on(motor):
     with pytest.raises(ValueError, match=r"^reference of a DCMotor scenario"):
         simulate(plant, [good[0].replace(noise_seed=0), good[1]])
     equal(advance(flights, 151), advance(expected, 151), flights)
+
+
+@kernel
+def third(r):
+    return r[2]
+
+
+@kernel
+def control_by_a_helper(t, y, r, q, c, u):
+    u[0] = third(r)
+
+
+@kernel
+def known_beyond(t, r, c, out):
+    out[0] = 1.0
+
+
+@kernel
+def control_once_it_turns(t, y, r, q, c, u):
+    u[0] = r[0] if y[1] < 5.0 else r[1]
+
+
+NARROW = {
+    "a reference": (lambda p: {"reference": lambda s: np.zeros((s.steps + 1, 0))}, "control"),
+    "parameters of the controller": (lambda p: {"q": np.zeros(1)}, "control"),
+    "a controller's state": (lambda p: {"c0": np.zeros(0)}, "control"),
+    "disturbances": (lambda p: {"disturbances": (), "disturbance": None}, "dynamics"),
+    "physical parameters": (lambda p: {"physical": lambda changes: np.zeros(0)}, "dynamics"),
+    "outputs": (lambda p: {"outputs": p.outputs[:1]}, "output"),
+    "what a helper reads": (lambda p: {"kernels": p.kernels._replace(control=control_by_a_helper)}, "control"),
+    "known signals": (lambda p: {"kernels": p.kernels._replace(known=known_beyond)}, "known"),
+}
+
+
+@pytest.mark.parametrize("what", NARROW)
+def test_a_kernel_that_reaches_beyond_its_arrays_is_refused_before_it_flies(motor, what):
+    change, role = NARROW[what]
+    plant = dataclasses.replace(motor, **change(motor))
+    for _ in range(2):  # it does not pass by having been asked
+        with pytest.raises(ValueError, match=rf"^DCMotor: the kernel '{role}' reaches beyond its arrays: index \d"):
+            simulate(plant, [draw(plant.process("standard"), 0)])
+
+
+def test_check_plant_finds_a_kernel_that_reaches_beyond_later_in_a_flight(motor):
+    plant = dataclasses.replace(motor, kernels=motor.kernels._replace(control=control_once_it_turns))
+    with pytest.raises(ValueError, match="the kernel 'control' reaches beyond its arrays"):
+        check_plant(plant, range(1))
 
 
 def test_theta_is_what_the_scenarios_table_says(plant):

@@ -123,7 +123,7 @@ def test_mismatch_changes_the_truth_and_not_the_model():
 
 
 BAD = [
-    ({"task": "prediction"}, "isolation, identification, diagnosis, scenario"),
+    ({"task": "prediction"}, "isolation, modes, identification, diagnosis, scenario"),
     ({"process": "easy"}, "standard"),
     ({"units": "furlongs"}, "physical, scaled"),
     ({"decision_period": 0}, "at least 1"),
@@ -214,8 +214,9 @@ def test_pictures(plant, task):
     env = FDIEnv(plant.id, task=task, render_mode="rgb_array")
     env.reset(seed=1)
     blank = env.render()
+    nothing = {"isolation": 0, "modes": np.zeros(len(plant.modes), int)}.get(task, getattr(env.action_space, "low", None))
     for _ in range(30):
-        env.step(0 if task == "isolation" else env.action_space.low)
+        env.step(nothing)
     picture = env.render()
     assert picture.shape == blank.shape
     assert picture.dtype == np.uint8

@@ -178,11 +178,12 @@ def test_committed_page_is_what_the_rows_say():
 
 
 def test_every_committed_table_is_framed():
-    """A suite with rows has its floor and its ceiling."""
+    """A suite with rows has its floor and its ceiling; where sensors may fail no oracle is one yet, and one stands above."""
     for folder in sorted((ROOT / "leaderboards" / "results").glob("*/")):
         rows = leaderboard.read_rows(folder)
         assert {"null", "random"} <= {row.diagnoser for row in rows}, folder.name
-        assert any(tables.ceiling(row) for row in rows), folder.name
+        above = tables.ceiling if load_suite(folder.name).build().bare is None else tables.clairvoyant
+        assert any(above(row) for row in rows), folder.name
 
 
 def test_no_committed_row_beats_a_ceiling():
@@ -251,7 +252,7 @@ def test_command_line_end_to_end(capsys, small, tmp_path, monkeypatch):
     shown = capsys.readouterr().out
     assert "| two_stage_kf " in shown
     assert "rudder stuck" in shown
-    cli.main(["verify", *map(str, (results / "small").glob("*.json"))])
+    cli.main(["verify", *map(str, (results / "small").glob("*.json")), "--jobs", "1"])
     assert capsys.readouterr().out.count("same outcomes") == 2
     pages.mkdir()
     cli.main(["leaderboard", "--results", str(results), "--pages", str(pages)])

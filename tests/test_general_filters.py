@@ -18,7 +18,7 @@ from fdi_gym.estimation.augmented import augmented
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration, Persistence, gain
 from fdi_gym.estimation.data import digest, from_json, to_json
-from fdi_gym.estimation.decision import STATISTICS, Reading, chi_square, cusum, declare, glr, undeclared
+from fdi_gym.estimation.decision import STATISTICS, Reading, by_labels, chi_square, cusum, declare, glr, undeclared
 from fdi_gym.estimation.gaussian import RULES
 from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.labels import Manifolds, nearest_of
@@ -522,3 +522,27 @@ def test_builders_fly_nothing_and_say_why_they_cannot(monkeypatch, plant_id, nam
     assert not reason or (len(reason) > 20 and name in FAMILY), reason
     with pytest.raises(ValueError, match="no such"):
         make_diagnoser(name, plant, process="no such", **({"scenarios": []} if entry.clairvoyant else {}))
+
+
+def test_after_a_gap_labels_wait_until_the_estimate_is_as_sure_as_before(b747):
+    """What is unsure since a gap raises no alarm; the same readings without a gap do, and so they do once they are sure."""
+    thresholds = {mode.name: 9.0 for mode in b747.modes}
+    rule = by_labels(b747, Calibration(thresholds=thresholds, persistence=Persistence(3, 3, 3)))
+    p, mode = len(b747.estimated), b747.modes[0]
+    faulty = np.asarray(mode.offset) + mode.reach[1] * np.asarray(mode.direction)
+
+    def alarms(gap, wide):
+        state, found = rule.start(1), []
+        for k in range(60):
+            inside, after = 20 <= k < 30, 30 <= k < 30 + wide
+            reading = Reading(
+                faulty[None] if k >= 20 else np.zeros((1, p)), 1e-4 * (3.0 if inside or after else 1.0) * np.eye(p)[None]
+            )
+            state, verdict = rule.step(state, np.array([k]), reading, np.array([not (gap and inside)]))
+            found.append(bool(verdict.alarm[0]))
+        return np.flatnonzero(found)
+
+    assert alarms(gap=False, wide=15)[0] == 22
+    assert alarms(gap=True, wide=0)[0] == 32
+    assert alarms(gap=True, wide=15)[0] == 47
+    assert alarms(gap=True, wide=15)[-1] == 59

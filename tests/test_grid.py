@@ -4,7 +4,7 @@ import msgspec
 import pytest
 from conftest import ROOT
 
-from benchmarks.grid import KINDS, PAPER, missing, page, reasons_of, rows_of
+from benchmarks.grid import KINDS, families, missing, page, reasons_of, rows_of
 from fdi_gym.diagnosis import diagnosers
 from fdi_gym.files import pretty
 from fdi_gym.leaderboard import read_rows
@@ -19,7 +19,7 @@ def test_page_is_rendered_from_the_rows():
     assert (ROOT / "leaderboards" / "grid.md").read_text() == page(RESULTS, FIGURES)
 
 
-@pytest.mark.parametrize("family", PAPER)
+@pytest.mark.parametrize("family", families())
 def test_every_pair_has_a_row_or_a_reason_or_is_named_as_missing(family):
     absent = missing(RESULTS, FIGURES)
     for kind in KINDS:
@@ -31,7 +31,7 @@ def test_every_pair_has_a_row_or_a_reason_or_is_named_as_missing(family):
         assert all(reasons.values())
 
 
-@pytest.mark.parametrize("family", list(PAPER))
+@pytest.mark.parametrize("family", families())
 def test_reasons_are_the_codes_own(family):
     suite = load_suite(f"{family}-standard")
     assert FIGURES["reasons"][suite.name] == reasons_of(suite)

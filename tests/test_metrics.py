@@ -8,7 +8,7 @@ from conftest import build
 from fdi_gym.diagnosis import Decisions
 from fdi_gym.engine import Record
 from fdi_gym.faults import Scoring
-from fdi_gym.intervals import strata, within
+from fdi_gym.intervals import resamples, strata, within
 from fdi_gym.metrics import Declaration, Onset, check_outcomes, outcome, scored_samples
 from fdi_gym.scores import balanced_accuracy, delay_quartiles, macro_f1, restricted_mean, summarise, survival
 
@@ -255,6 +255,8 @@ def test_strata_are_the_rarest_labels_and_none_has_one_flight():
     assert strata([[0], [0], [1, 2], [1], [1], [1]]).tolist() == [0, 0, 1, 1, 1, 1]
     assert strata([[0], [1], [2]]).tolist() == [-1, -1, -1]
     assert strata([[], [0], [0]]).tolist() == [0, 0, 0]
+    assert strata([[1], [0], [2], [2], [0], [2], [1], [1], [1], [3]]).tolist() == [1, 0, 2, 2, 0, 2, 1, 1, 1, 1]
+    assert strata([[2]]).tolist() == [-1]  # nothing else is there
 
 
 def test_the_variance_of_a_sum_over_flights_is_what_drawing_flights_anew_within_strata_gives():
@@ -268,6 +270,17 @@ def test_the_variance_of_a_sum_over_flights_is_what_drawing_flights_anew_within_
     assert within(values, stratum)[0] == pytest.approx(
         sum((stratum == s).sum() * values[stratum == s, 0].var(ddof=1) for s in range(2))
     )
+
+
+def test_resamples_draw_as_many_flights_of_each_stratum_as_it_has():
+    stratum = np.array([3, 0, 3, -1, 0, 3, -1])
+    drawn = resamples(stratum, 4000, seed=1)
+    for s in np.unique(stratum):
+        assert (drawn[:, stratum == s].sum(axis=1) == (stratum == s).sum()).all()
+    assert drawn.mean(axis=0) == pytest.approx(np.ones(7), abs=0.05)
+    assert drawn.var(axis=0) == pytest.approx(1 - 1 / np.array([3, 2, 3, 2, 2, 3, 2]), abs=0.05)
+    assert np.array_equal(drawn, resamples(stratum, 4000, seed=1))
+    assert not np.array_equal(drawn, resamples(stratum, 4000, seed=2))
 
 
 GOOD = episode(truth="..AAAA", said="...AAA", estimate=np.zeros((6, 4)), std=np.ones((6, 4)), probs=np.full((6, 5), 0.2))

@@ -5,12 +5,13 @@ import runpy
 import sys
 
 import pytest
-from conftest import PLANTS, ROOT
+from conftest import ROOT
 
 from benchmarks.reproduction.comparison import Comparisons
 from benchmarks.reproduction.missile_pitch.measure import numbered, unclipped
 from benchmarks.reproduction.pieces import finished, pieces, reference
 from fdi_gym.files import read_json
+from fdi_gym.suite import load_suite, suite_names
 
 FOLDER = ROOT / "benchmarks" / "reproduction"
 FOLDERS = sorted(path.name for path in FOLDER.iterdir() if (path / "__main__.py").exists())
@@ -27,8 +28,10 @@ def leaves(nest):
     return [v for part in nest for v in leaves(part)] if isinstance(nest, list) else [nest]
 
 
-def test_every_shipped_plant_has_a_folder():
-    assert {name.replace("_", "") for name in FOLDERS} == {plant.lower() for plant in PLANTS}
+def test_every_plant_of_a_paper_has_a_folder():
+    """Those that fly a paper's scenario; and no folder is of another."""
+    papers = {load_suite(name).plant for name in suite_names() if name.endswith("-paper")}
+    assert {name.replace("_", "") for name in FOLDERS} == {plant.lower() for plant in papers}
 
 
 @pytest.mark.parametrize("name", FOLDERS)

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from fdi_gym import discovery, evaluation, leaderboard, row, suite, tables, verification
+from fdi_gym import cli, discovery, evaluation, leaderboard, row, suite, tables, verification
 from fdi_gym.diagnosis import diagnosers, registry
 from fdi_gym.estimation import data
 from fdi_gym.evaluation import applicable, digests_of, evaluate, settings_of
@@ -96,7 +96,7 @@ def leaves(value, keys=()):
 
 def test_honest_rows_are_verified(rows):
     for name in NAMES:
-        assert len(verify(row_path(rows, "small", name), share=0.3)) == 3
+        assert len(verify(row_path(rows, "small", name), share=0.3).episodes) == 3
 
 
 def test_no_field_of_a_row_can_be_forged(rows):
@@ -176,11 +176,11 @@ def test_the_sample_is_the_verifiers(rows, monkeypatch):
     path = doctored(rows, [2])
     with monkeypatch.context() as patched:
         patched.setattr(verification, "check_episodes", lambda *arguments: None)
-        drawn = [tuple(verify(path, share=0.25)) for _ in range(40)]
+        drawn = [tuple(verify(path, share=0.25).episodes) for _ in range(40)]
         assert len(set(drawn)) > 10
         assert verify(path, share=0.25, seed=5) == verify(path, share=0.25, seed=5)
-        hit = next(seed for seed in range(100) if 2 in verify(path, share=0.25, seed=seed))
-        missed = next(seed for seed in range(100) if 2 not in verify(path, share=0.25, seed=seed))
+        hit = next(seed for seed in range(100) if 2 in verify(path, share=0.25, seed=seed).episodes)
+        missed = next(seed for seed in range(100) if 2 not in verify(path, share=0.25, seed=seed).episodes)
     with pytest.raises(RefusedError, match=r"outcomes\[2\]"):
         verify(path, share=0.25, seed=hit)
     assert verify(path, share=0.25, seed=missed)
@@ -264,26 +264,153 @@ def test_compressed_outcomes_are_the_same_bytes_and_refused_when_damaged(rows):
     assert whole[4:8] == b"\0\0\0\0"  # no time
 
 
+# -- renewing
+
+
+def held(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_renewing_writes_the_digests_of_what_is_here_and_nothing_else(rows):
+    frozen, name = load_suite("small"), "two_stage_ekf"
+    write_rows(rows, frozen, evaluate(frozen, [name], work=rows.parent / "work", **QUIET))
+    path, honest = row_path(rows, "small", name), held(rows / "small")
+    kinds = set(read_row(path).digests) - {"outcomes"}
+    assert kinds == {"method", "plant", "engine", "belief", "calibration"}
+    for kind in (*sorted(kinds), "data"):  # one that is no more
+        change(path, ("digests", kind), "f" * 64)
+        with pytest.raises(RefusedError, match=rf"digests\.{kind}: .*renew it"):
+            verify(path)
+        assert verify(path, renew=True).renewed == [kind]
+        assert held(rows / "small") == honest
+        assert verify(path).renewed == []
+    before = path.stat().st_mtime_ns
+    assert verify(path, renew=True).renewed == []
+    assert path.stat().st_mtime_ns == before
+
+
+def test_a_forged_row_is_never_renewed(rows):
+    """Whatever else is changed in a row of other sources, it is refused and stays as it is."""
+    path = row_path(rows, "small", FILTER)
+    change(path, ("digests", "engine"), "f" * 64)
+    old = path.read_bytes()
+    places = [(keys, value) for keys, value in leaves(json.loads(old)) if keys[0] not in ("sha256", "digests")]
+    named = [i for i, (keys, _) in enumerate(places) if keys[0] != "metrics"]
+    assert len(named) >= 5
+    for i in {*np.random.default_rng(1).choice(len(places), 25, replace=False).tolist(), *named}:
+        keys, value = places[i]
+        change(path, keys, {bool: not value, int: 7, float: 0.123, str: "a" * 64}.get(type(value), 0.5))
+        forged = path.read_bytes()
+        with pytest.raises(ValueError, match=r"\w+"):
+            verify(path, share=1.0, renew=True)
+        assert path.read_bytes() == forged
+        path.write_bytes(old)
+    change(path, ("digests", "outcomes"), "f" * 64)
+    with pytest.raises(RefusedError, match="the digest differs"):
+        verify(path, renew=True)
+
+
+def test_made_up_outcomes_are_not_renewed(rows):
+    path = doctored(rows, range(8))
+    change(path, ("digests", "method"), "f" * 64)
+    before = held(rows / "small")
+    with pytest.raises(RefusedError, match=r"the code no longer gives this row; .*outcomes\[\d\]"):
+        verify(path, share=1.0, renew=True)
+    assert held(rows / "small") == before
+
+
+QUIET_METHOD = """
+import numpy as np
+from fdi_gym.diagnosis import Diagnoser, Diagnosis
+def build(plant):
+    return Diagnoser(lambda n: (), lambda s, y: (s, Diagnosis(np.full(len(y), True), np.full(len(y), 1))))
+"""
+
+
+def test_an_edited_source_makes_old_the_rows_of_its_method_alone(rows, modules):
+    """What changes no outcome is renewed, what does is refused; other methods' rows don't notice."""
+    frozen, names = load_suite("small"), ["first_method:build", "second_method:build"]
+    files = [modules / f"{name.partition(':')[0]}.py" for name in names]
+    for file in files:
+        file.write_text(QUIET_METHOD)
+    write_rows(rows, frozen, evaluate(frozen, names, work=rows.parent / "work", **QUIET))
+    paths = [row_path(rows, "small", name) for name in names]
+    honest = [path.read_bytes() for path in paths]
+
+    def edited(text):
+        files[0].write_text(text)
+        sys.modules.pop("first_method", None)
+        importlib.invalidate_caches()
+        return [found for _, found in verification.verify_all(paths, trust=names, renew=True)]
+
+    first, second = edited(f"# the same\n{QUIET_METHOD}")
+    assert (first.renewed, second.renewed) == (["method"], [])
+    renewed = paths[0].read_bytes()
+    old, new = json.loads(honest[0]), json.loads(renewed)
+    assert {k for k in old if old[k] != new[k]} == {"digests", "sha256"}
+    assert {k for k in old["digests"] if old["digests"][k] != new["digests"][k]} == {"method"}
+    first, second = edited(QUIET_METHOD.replace("len(y), 1", "len(y), 2"))
+    assert isinstance(first, RefusedError)
+    assert "the code no longer gives this row" in str(first)
+    assert second.renewed == []
+    assert [path.read_bytes() for path in paths] == [renewed, honest[1]]
+
+
+def test_many_rows_are_verified_past_one_that_fails(rows, capsys):
+    """A line each, in their order; status 2 at the end; those that are not renewed stay as they are."""
+    paths = [row_path(rows, "small", name) for name in NAMES]
+    honest = [path.read_bytes() for path in paths]
+    change(paths[0], ("metrics", "episodes"), 9)
+    change(paths[1], ("digests", "method"), "f" * 64)
+    forged = paths[0].read_bytes()
+    arguments = ["verify", *map(str, paths), str(rows / "small" / "made.json"), "--jobs", "2",
+                 "--suite", str(suite.SUITES / "small.json")]  # fmt: skip
+
+    def said(*more):
+        code = 0
+        try:
+            cli.main([*arguments, *more])
+        except SystemExit as stop:
+            code = stop.code
+        out, err = capsys.readouterr()
+        return code, out.splitlines(), [line for line in err.splitlines() if "refused" in line]
+
+    code, out, err = said()
+    assert (code, len(out), len(err)) == (2, 1, 3)
+    assert out[0].startswith(f"{paths[2]}: every figure follows")
+    assert err[0].startswith(f"{paths[0]}: refused: small/null: metrics.episodes")
+    assert err[1].startswith(f"{paths[1]}: refused: small/{FILTER}: digests.method")
+    assert err[2] == f"fdi-gym: 2 of 3 rows are refused, 0 renewed: {paths[0]}, {paths[1]}"
+    code, out, err = said("--renew")
+    assert (code, len(out), len(err)) == (2, 2, 2)
+    assert out[0].endswith("digests made anew: method")
+    assert err[1] == f"fdi-gym: 1 of 3 rows are refused, 1 renewed: {paths[0]}"
+    assert [path.read_bytes() for path in paths] == [forged, *honest[1:]]
+    paths[0].write_bytes(honest[0])
+    code, out, err = said("--renew")
+    assert (code, out[-1], err) == (0, "3 rows hold, 0 of them renewed", [])
+
+
 # -- writing loses nothing
 
 
 def test_rows_of_something_else_are_not_overwritten(rows):
     frozen = load_suite("small")
-    digests = {"null": digests_of(frozen, frozen.build(), "null")}
-    check_writable(rows, frozen, digests)
+    asked = [frozen, ["null"], functools.partial(digests_of, frozen, frozen.build())]
+    check_writable(rows, *asked)
     path = row_path(rows, "small", "null")
     for keys, words in ((("digests", "method"), "another method"), (("suite_sha256",), "another version of small")):
         honest = path.read_bytes()
         change(path, keys, "f" * 64)
         with pytest.raises(ValueError, match=words):
-            check_writable(rows, frozen, digests)
+            check_writable(rows, *asked)
         path.write_bytes(honest)
     change(path, ("digests", "method"), "f" * 64)
-    check_writable(rows, frozen, digests, replace=True)
+    check_writable(rows, *asked, replace=True)
     for file in (path, rows / "small" / "made.json"):
         file.write_text("mine")
         with pytest.raises(RefusedError, match="is not a"):
-            check_writable(rows, frozen, digests, replace=True)
+            check_writable(rows, *asked, replace=True)
         assert file.read_text() == "mine"
         shutil.copy(suite.SUITES / "small" / file.name, file)
 

@@ -484,7 +484,7 @@ def test_a_flown_plant_in_spawned_environments(motor):
     ("MissilePitch", {"fault_scale": 0}, "fault_scale"), ("MissilePitch", {"fault_scale": True}, "fault_scale"),
     ("HUAVHover", {"kappa": None}, "kappa"), ("HUAVHover", {"K_B": INF}, "K_B"), ("HUAVHover", {"K_B": -1.0}, "K_B"),
     ("CMGSatellite", {"snr": True}, "snr"), ("CMGSatellite", {"snr": -1e9}, "snr"),
-    ("CMGSatellite", {"steering": None}, "robust, pinv"), ("DCMotor", {"voltage": 3}, "DCMotor has none"),
+    ("CMGSatellite", {"steering": None}, "robust, pinv"), ("DCMotor", {"voltage": 3}, "DCMotor has sensor_faults"),
 ])  # fmt: skip
 def test_a_wrong_name_or_option_says_what_exists(plant_id, options, match):
     with pytest.raises(ValueError, match=match):

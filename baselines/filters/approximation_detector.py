@@ -211,7 +211,7 @@ def exceeded() -> Rule:
     return Rule(undeclared, step)
 
 
-@diagnoser("approximation_detector", "Online-approximation detector with noise margin")
+@diagnoser("approximation_detector", "Online-approximation detector with noise margin", reference=True)
 @diagnoser("approximation_detector_no_margin", "The same with the study's threshold, no noise margin", margin=False)
 def approximation_detector(plant: Plant, *, margin: bool = True) -> Diagnoser:
     """The detection estimator; it does not isolate, so its alarm comes with label 0.

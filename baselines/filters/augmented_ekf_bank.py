@@ -48,7 +48,7 @@ def likelihood_ratios(threshold: float, release: float | None, after: Persistenc
     return Rule(undeclared, step)
 
 
-@diagnoser("augmented_ekf_bank", "Augmented EKF bank, likelihood ratios, latched")
+@diagnoser("augmented_ekf_bank", "Augmented EKF bank, likelihood ratios, latched", reference=True)
 @diagnoser("augmented_ekf_bank_unlatched", "Augmented EKF bank, likelihood ratios with release",
            forgetting=0.98, threshold=30.0, release=15.0)  # fmt: skip
 def augmented_ekf_bank(

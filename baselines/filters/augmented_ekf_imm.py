@@ -52,7 +52,7 @@ def mixed(f: Filters, w: Array) -> Filters:
     return f._replace(z=z, P=P)
 
 
-@diagnoser("augmented_ekf_imm", "Augmented EKFs as interacting multiple models")
+@diagnoser("augmented_ekf_imm", "Augmented EKFs as interacting multiple models", reference=True)
 @diagnoser("augmented_ekf_mode_probabilities", "The bank's filters with mode probabilities, no interaction",
            interaction=False, dwell=4.0, sigma_rho=ekf.SIGMA_RHO)  # fmt: skip
 def augmented_ekf_imm(

@@ -75,8 +75,8 @@ def reading_of(model: AugmentedModel, s: Gaussian) -> Reading:
     return Reading(s.X[:, z], s.P[:, z, z], s.X[:, x], s.P[:, x, x], s.nu, s.S, s.seen)
 
 
-@diagnoser("augmented_ekf", "Augmented extended Kalman filter, for any plant")
-@diagnoser("augmented_ukf", "Augmented unscented Kalman filter, for any plant", rule="unscented")
+@diagnoser("augmented_ekf", "Augmented extended Kalman filter, for any plant", reference=True)
+@diagnoser("augmented_ukf", "Augmented unscented Kalman filter, for any plant", reference=True, rule="unscented")
 @diagnoser("augmented_cdkf", "Augmented central-difference Kalman filter, for any plant", rule="central difference")
 @diagnoser("augmented_ekf_thresholds", "The augmented EKF, fixed thresholds on the estimate", decision="thresholds")
 @diagnoser("augmented_ekf_chi_square", "The augmented EKF, alarms by a chi-square test of its innovations",

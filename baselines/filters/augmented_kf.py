@@ -64,7 +64,7 @@ def augmented_filter(plant: Plant, aged: Callable[[Array], Array]) -> Filter:
     return Filter(start, predict, update, read, first_sample=False)
 
 
-@diagnoser("augmented_kf", "Augmented Kalman filter, exponential forgetting", forgetting="exponential")
+@diagnoser("augmented_kf", "Augmented Kalman filter, exponential forgetting", reference=True, forgetting="exponential")
 def augmented_kf(
     plant: Plant,
     *,

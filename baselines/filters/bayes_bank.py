@@ -183,7 +183,7 @@ def concluded(s: Onsets, m: int, now: Array, sizes: Sizes) -> Onsets:
     return s._replace(probs=np.where(now[:, None], probs, s.probs), z=np.where(now[:, None], mean, s.z))
 
 
-@diagnoser("bayes_bank", "Bayes bank over onsets and types, true priors: the bound of the standard process")
+@diagnoser("bayes_bank", "Bayes bank over onsets and types, true priors: the bound of the standard process", reference=True)
 def bayes_bank(
     plant: Plant,
     *,

@@ -74,7 +74,7 @@ def search_of(grid: str, entries: Array, inc: float) -> Search:
 
 @diagnoser("caukf", "Joint UKF, covariance adapted element by element", grid="elements")
 @diagnoser("gaukf", "Joint UKF, covariance adapted by binary grid search", grid="full")
-@diagnoser("sgaukf", "Joint UKF, covariance adapted by the simplified grid, alternating")
+@diagnoser("sgaukf", "Joint UKF, covariance adapted by the simplified grid, alternating", reference=True)
 @diagnoser("sgaukf_odd", "Joint UKF, covariance adapted by the simplified grid, odd elements only", grid="odd")
 @diagnoser("dual_caukf", "Dual UKF, covariance adapted element by element", grid="elements", form="dual", inc=INC_DUAL)
 @diagnoser("dual_gaukf", "Dual UKF, covariance adapted by binary grid search", grid="full", form="dual", inc=INC_DUAL)

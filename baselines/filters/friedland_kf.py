@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import void
 
-from baselines.filters.two_stage_kernels import M3, product, symmetric, times
+from baselines.filters.two_stage_kernels import M3, inner, product, product_with_transposed, sensitivity, symmetrise
 from baselines.filters.two_stage_kf import TwoStage, decision_rule, initial_covariances, read, start
 from baselines.filters.two_stage_kf import correct as two_stage_correct
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
@@ -20,12 +20,20 @@ from fdi_gym.plant import Array, Plant
 
 @compiled(void(M, M3, M3, M, M, M, M, M3, M3, M, M3, M3))
 def _predict(x, Px, V, u, A, B, E_0, E_u, Q, x1, Px1, V1):
-    for k in range(len(x)):
-        E = E_0.copy()
-        for j in range(len(E_u)):
-            E += u[k, j] * E_u[j]
-        x1[k], V1[k] = times(A, x[k]) + times(B, u[k]), product(A, V[k]) + E
-        Px1[k] = symmetric(product(product(A, Px[k]), A.T) + Q[k % len(Q)])
+    n, n_x, p = V.shape
+    E, APx = np.empty((n_x, p)), np.empty((n_x, n_x))
+    for k in range(n):
+        sensitivity(E_0, E_u, u[k], E)
+        product(A, V[k], V1[k])
+        product(A, Px[k], APx)
+        product_with_transposed(APx, A, Px1[k])
+        for i in range(n_x):
+            x1[k, i] = inner(A[i], x[k]) + inner(B[i], u[k])
+            for j in range(p):
+                V1[k, i, j] += E[i, j]
+            for j in range(n_x):
+                Px1[k, i, j] += Q[k % len(Q), i, j]
+        symmetrise(Px1[k])
 
 
 def predict(s: TwoStage, u: Array, model: LinearModel, Q: Array, Qz: Array) -> TwoStage:

@@ -170,7 +170,7 @@ def elimination(classes: tuple[int, ...], strict: bool) -> Rule:
     return Rule(detected.start, step)
 
 
-@diagnoser("gos", "Adaptive estimator bank, 5 classes, tie-broken")
+@diagnoser("gos", "Adaptive estimator bank, 5 classes, tie-broken", reference=True)
 @diagnoser("gos_strict", "Adaptive estimator bank, 5 classes, strict verdict", strict=True)
 @diagnoser("gos_two_class", "Adaptive estimator bank of the study, classes 1 and 2, tie-broken", classes=(1, 2))
 @diagnoser("gos_two_class_strict", "Adaptive estimator bank of the study, classes 1 and 2, strict verdict",

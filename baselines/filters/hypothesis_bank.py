@@ -147,7 +147,7 @@ def bank_filter(
     return Filter(start, predict, update, read, first_sample=False)
 
 
-@diagnoser("hypothesis_bank", "Bank of extended Kalman filters, one per label (HypBank)")
+@diagnoser("hypothesis_bank", "Bank of extended Kalman filters, one per label (HypBank)", reference=True)
 def hypothesis_bank(
     plant: Plant,
     *,

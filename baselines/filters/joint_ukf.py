@@ -156,7 +156,7 @@ def joint_filter(
     return Filter(start, predict, update, read, expect=lambda s, at: expected(s.now.x, s.known, s.now.sign))
 
 
-@diagnoser("joint_ukf", "Joint unscented Kalman filter of state and effectiveness")
+@diagnoser("joint_ukf", "Joint unscented Kalman filter of state and effectiveness", reference=True)
 def joint_ukf(
     plant: Plant,
     *,

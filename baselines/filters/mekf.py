@@ -189,7 +189,7 @@ def mekf_filter(
     return Filter(start, predict, update, read, expect=expect)
 
 
-@diagnoser("mekf", "Multiplicative extended Kalman filter, covariance opened by a test on the innovations")
+@diagnoser("mekf", "Multiplicative extended Kalman filter, covariance opened by a test on the innovations", reference=True)
 def mekf(
     plant: Plant,
     *,

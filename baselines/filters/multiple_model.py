@@ -85,12 +85,14 @@ class Models(NamedTuple):
     P: Array  # (n, labels, N, N)
     mu: Array  # (n, labels) probabilities of the labels
     c: Array  # (n, labels) predicted ones
+    nu: Array  # (n, m) innovation of the first label's filter
+    S: Array  # (n, m, m) its covariance
 
 
 def bank(b: Hypotheses) -> Filter:
     """The filter of all models."""
     model, labels = b.model, len(b.m0)
-    N, z, x = len(model.scale), model.z, model.x
+    N, m, z, x = len(model.scale), len(model.R), model.z, model.x
     assert model.lines is not None
     offset, direction = model.lines
 
@@ -99,20 +101,21 @@ def bank(b: Hypotheses) -> Filter:
         X[..., z], P[..., z, z] = b.m0, b.M0
         mu = np.full((n, labels), LEAST)
         mu[:, 0] = 1.0
-        return Models(X, P, mu, mu)
+        return Models(X, P, mu, mu, np.zeros((n, m)), np.tile(model.R, (n, 1, 1)))
 
     def predict(s: Models, at: Interval) -> Models:
         n = len(s.mu)
         c, w = mixing.ahead(s.mu, b.transition)
         X, P = mixing.mix(w, s.X, s.P, z, b.m0, b.M0)
         X, P = model.predict("extended", X.reshape(-1, N), P.reshape(-1, N, N), at)
-        return Models(X.reshape(n, labels, N), P.reshape(n, labels, N, N), s.mu, c)
+        return s._replace(X=X.reshape(n, labels, N), P=P.reshape(n, labels, N, N), c=c)
 
     def update(s: Models, at: Interval, y: Array, seen: Array) -> Models:
         n = len(s.mu)
         done = model.update("extended", s.X.reshape(-1, N), s.P.reshape(-1, N, N), at, y, seen)
         mu = mixing.weigh(s.c, done.log_likelihood.reshape(n, labels), LEAST)
-        return Models(done.X.reshape(n, labels, N), done.P.reshape(n, labels, N, N), mu, mu)
+        nu, S = done.nu.reshape(n, labels, m)[:, 0], done.S.reshape(n, labels, m, m)[:, 0]
+        return Models(done.X.reshape(n, labels, N), done.P.reshape(n, labels, N, N), mu, mu, nu, S)
 
     def state(s: Models) -> Array:
         mu = s.mu / s.mu.sum(axis=1, keepdims=True)
@@ -125,12 +128,14 @@ def bank(b: Hypotheses) -> Filter:
         D = deviation - mean[:, None]
         within = direction @ s.P[..., z, z] @ np.swapaxes(direction, -1, -2)
         P = (mu[..., None, None] * (within + D[..., :, None] * D[..., None, :])).sum(axis=1)
-        return Reading(mean, P, state(s), cost=-2.0 * np.log(s.mu), probs=mu)
+        return Reading(mean, P, state(s), nu=s.nu, S=s.S, cost=-2.0 * np.log(s.mu), probs=mu)
 
     return Filter(start, predict, update, read, expect=lambda s, at: model.expect(state(s), at))
 
 
-@diagnoser("multiple_model_ekf", "Interacting multiple models, one extended Kalman filter per label, for any plant")
+@diagnoser(
+    "multiple_model_ekf", "Interacting multiple models, one extended Kalman filter per label, for any plant", reference=True
+)
 def multiple_model_ekf(plant: Plant, belief: Belief, calibration: Calibration) -> Diagnoser:
     """The bank with its decision.
 

@@ -247,7 +247,7 @@ def robust_three_stage_filter(plant: Plant, known: Known, rule: str) -> Filter:
     return Filter(lambda n: start(n, known.x0, known.P0, cov_b, cov_d), ahead, measured, read, first_sample=False)
 
 
-@diagnoser("robust_three_stage_cdkf", "Robust three-stage central-difference Kalman filter (RThSCDKF)")
+@diagnoser("robust_three_stage_cdkf", "Robust three-stage central-difference Kalman filter (RThSCDKF)", reference=True)
 @diagnoser("robust_three_stage_ekf", "Robust three-stage extended Kalman filter (RThSEKF)", rule="extended")
 def robust_three_stage(
     plant: Plant,

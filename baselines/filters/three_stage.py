@@ -166,7 +166,7 @@ def three_stage_filter(plant: Plant, known: Known, rule: str) -> Filter:
     return Filter(begin, ahead, measured, read, first_sample=False)
 
 
-@diagnoser("three_stage_cdkf", "Three-stage central-difference Kalman filter (ThSCDKF)")
+@diagnoser("three_stage_cdkf", "Three-stage central-difference Kalman filter (ThSCDKF)", reference=True)
 @diagnoser("three_stage_ekf", "Three-stage extended Kalman filter (ThSEKF)", rule="extended")
 def three_stage(
     plant: Plant,

@@ -6,91 +6,159 @@ Equation numbers: A. Guven, C. Hajiyev, WSEAS Transactions on Signal Processing 
 import numpy as np
 from numba import boolean, float64, int64, void
 
-from fdi_gym.estimation.compiled import eliminate, helper
-from fdi_gym.kernels import M, compiled
+from fdi_gym.estimation.compiled import eliminate
+from fdi_gym.kernels import M, compiled, helper
 
 M3, B2, I1 = float64[:, :, ::1], boolean[:, ::1], int64[::1]
 DIRECTIONAL, EXPONENTIAL = 1, 2
 
-
-@helper
-def solved(S, N):
-    """S^-1 N."""
-    a, b = S.copy(), N.copy()
-    eliminate(a, b)
-    return b
+# For matrices of this size a call of BLAS, or a new array for each result, costs several times what the loops do.
 
 
 @helper
-def product(A, B):
-    """A B: for matrices of this size a call of BLAS costs several times what the loops do."""
-    (n, m), r = A.shape, B.shape[1]
-    C = np.zeros((n, r))
-    for i in range(n):
-        for k in range(m):
-            for j in range(r):
+def product(A, B, C):
+    """C = A B."""
+    for i in range(A.shape[0]):
+        for j in range(B.shape[1]):
+            C[i, j] = 0.0
+        for k in range(A.shape[1]):
+            for j in range(B.shape[1]):
                 C[i, j] += A[i, k] * B[k, j]
-    return C
 
 
 @helper
-def times(A, v):
-    """A v."""
-    n, m = A.shape
-    w = np.empty(n)
-    for i in range(n):
-        total = 0.0
-        for k in range(m):
-            total += A[i, k] * v[k]
-        w[i] = total
-    return w
+def product_with_transposed(A, B, C):
+    """C = A B'."""
+    for i in range(A.shape[0]):
+        for j in range(B.shape[0]):
+            total = 0.0
+            for k in range(A.shape[1]):
+                total += A[i, k] * B[j, k]
+            C[i, j] = total
 
 
 @helper
-def symmetric(P):
-    """(P + P') / 2: what rounding took away."""
-    return 0.5 * (P + P.T)
+def product_of_transposed(A, B, C):
+    """C = A' B."""
+    for i in range(A.shape[1]):
+        for j in range(B.shape[1]):
+            C[i, j] = 0.0
+        for k in range(A.shape[0]):
+            for j in range(B.shape[1]):
+                C[i, j] += A[k, i] * B[k, j]
+
+
+@helper
+def inner(a, b):
+    """a' b."""
+    total = 0.0
+    for k in range(a.size):
+        total += a[k] * b[k]
+    return total
+
+
+@helper
+def sensitivity(E_0, E_u, u, E):
+    """E of the fault parameter under the command u."""
+    for a in range(E.shape[0]):
+        for b in range(E.shape[1]):
+            E[a, b] = E_0[a, b]
+            for j in range(u.size):
+                E[a, b] += u[j] * E_u[j, a, b]
+
+
+@helper
+def symmetrise(P):
+    """P becomes (P + P') / 2: what rounding took away."""
+    for i in range(P.shape[0]):
+        for j in range(i + 1):
+            P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
 
 
 @compiled(void(M3, int64, float64, float64, float64, float64, M3))
 def forget(Pz, rule, factor, a_min, a_max, q, aged):
     """Pz (n, p, p) under forgetting, eigenvalue by eigenvalue (`two_stage_kf.forget`), and q more on its diagonal."""
-    eye = np.eye(Pz.shape[1])
-    for e in range(len(Pz)):
-        P, limit = Pz[e], np.inf
-        if rule == DIRECTIONAL:
-            limit, aged[e] = a_max, a_min * eye + P * ((a_max - a_min) / a_max)
-        elif rule == EXPONENTIAL:
-            limit, aged[e] = factor * a_max, P / factor
-        else:
-            aged[e] = P
-        if (P * P).sum() > limit * limit:
-            a, v = np.linalg.eigh(symmetric(P))
-            for i in range(len(a)):
+    n, p, _ = Pz.shape
+    limit = a_max if rule == DIRECTIONAL else factor * a_max if rule == EXPONENTIAL else np.inf
+    for e in range(n):
+        squares = 0.0
+        for i in range(p):
+            for j in range(p):
+                squares += Pz[e, i, j] * Pz[e, i, j]
+                if rule == DIRECTIONAL:
+                    aged[e, i, j] = (a_min if i == j else 0.0) + Pz[e, i, j] * ((a_max - a_min) / a_max)
+                elif rule == EXPONENTIAL:
+                    aged[e, i, j] = Pz[e, i, j] / factor
+                else:
+                    aged[e, i, j] = Pz[e, i, j]
+        if squares > limit * limit:
+            P = Pz[e].copy()
+            symmetrise(P)
+            a, v = np.linalg.eigh(P)
+            for k in range(p):
                 if rule == EXPONENTIAL:
-                    a[i] = max(a[i], min(a[i] / factor, a_max))
-                elif a[i] <= a_max:
-                    a[i] = a_min + a[i] * (a_max - a_min) / a_max
-            aged[e] = product(v * a, v.T)
-        aged[e] += q * eye
+                    a[k] = max(a[k], min(a[k] / factor, a_max))
+                elif a[k] <= a_max:
+                    a[k] = a_min + a[k] * (a_max - a_min) / a_max
+            for i in range(p):
+                for j in range(p):
+                    aged[e, i, j] = 0.0
+                    for k in range(p):
+                        aged[e, i, j] += v[i, k] * a[k] * v[j, k]
+        for i in range(p):
+            for j in range(p):
+                aged[e, i, j] += q if i == j else 0.0
 
 
 @compiled(void(M, M3, M, M3, M3, M3, boolean, M, M, M, M, M3, M3, M, M3, M3))
 def predict(x, Px, z, Pz, V, Pz_minus, steady, u, A, B, E_0, E_u, Q, x1, Px1, V1):
     """Over the interval under the command u, eqs. 24 to 31. `steady`: Pz_minus is Pz."""
-    for k in range(len(x)):
-        E = E_0.copy()
-        for j in range(len(E_u)):
-            E += u[k, j] * E_u[j]
-        W = product(A, V[k]) + E
-        WPz = product(W, Pz[k])
-        if steady:
-            V1[k] = W
-        else:
-            V1[k] = solved(Pz_minus[k], WPz.T).T
-        x1[k] = times(A, x[k]) + times(B, u[k]) + times(W - V1[k], z[k])
+    n, n_x, p = V.shape
+    E, W, WPz, D, a, b = (
+        np.empty((n_x, p)), np.empty((n_x, p)), np.empty((n_x, p)), np.empty((n_x, p)), np.empty((p, p)), np.empty((p, n_x))
+    )  # fmt: skip
+    APx, P = np.empty((n_x, n_x)), np.empty((n_x, n_x))
+    for k in range(n):
+        sensitivity(E_0, E_u, u[k], E)
+        product(A, V[k], W)
+        for i in range(n_x):
+            for j in range(p):
+                W[i, j] += E[i, j]
+        product(W, Pz[k], WPz)
+        if not steady:  # V Pz- = W Pz
+            for i in range(p):
+                for j in range(p):
+                    a[i, j] = Pz_minus[k, i, j]
+                for j in range(n_x):
+                    b[i, j] = WPz[j, i]
+            eliminate(a, b)
+        for i in range(n_x):
+            for j in range(p):
+                V1[k, i, j] = W[i, j] if steady else b[j, i]
+                D[i, j] = W[i, j] - V1[k, i, j]
+            x1[k, i] = inner(A[i], x[k]) + inner(B[i], u[k]) + inner(D[i], z[k])
         # W Pz W' - V Pz- V', with V Pz- = W Pz
-        Px1[k] = symmetric(product(product(A, Px[k]), A.T) + Q[k % len(Q)] + product(WPz, (W - V1[k]).T))
+        product(A, Px[k], APx)
+        product_with_transposed(APx, A, Px1[k])
+        product_with_transposed(WPz, D, P)
+        for i in range(n_x):
+            for j in range(n_x):
+                Px1[k, i, j] = Px1[k, i, j] + Q[k % len(Q), i, j] + P[i, j]
+        symmetrise(Px1[k])
+
+
+@helper
+def corrected(x, P, K, r, HP, x1, P1):
+    """x + K' r and P - K' HP."""
+    product_of_transposed(K, HP, P1)
+    for i in range(x.size):
+        gained = 0.0
+        for a in range(r.size):
+            gained += K[a, i] * r[a]
+        x1[i] = x[i] + gained
+        for j in range(x.size):
+            P1[i, j] = P[i, j] - P1[i, j]
+    symmetrise(P1)
 
 
 @compiled(void(M, M3, M, M3, M3, M, B2, M, M, M, M3, M, M3, M3, M, M3, I1))
@@ -99,28 +167,59 @@ def correct(x, Px, z, Pz, V, y, seen, C, R, x1, Px1, z1, Pz1, V1, nu, S_z, count
 
     A sensor that did not report has residual 0, variance 1 and no covariance with anything: its row is gone.
     """
-    for k in range(len(x)):
-        r, H, CPx = y[k] - times(C, x[k]), product(C, V[k]), product(C, Px[k])
-        S = product(CPx, C.T) + R
+    (n, n_x, p), m = V.shape, y.shape[1]
+    r, H, CPx, HPz, S = np.empty(m), np.empty((m, p)), np.empty((m, n_x)), np.empty((m, p)), np.empty((m, m))
+    a, Kx, Kz = np.empty((m, m)), np.empty((m, n_x)), np.empty((m, p))  # gains, transposed
+    for k in range(n):
+        product(C, V[k], H)
+        product(C, Px[k], CPx)
+        product_with_transposed(CPx, C, S)
         count[k] = 0
-        for i in range(len(r)):
-            if seen[k, i]:
-                count[k] += 1
-            else:
-                r[i], H[i], CPx[i] = 0.0, 0.0, 0.0
-                S[i], S[:, i], S[i, i] = 0.0, 0.0, 1.0
-        HPz = product(H, Pz[k])
-        S_z[k] = product(HPz, H.T) + S
-        Kx, Kz = solved(S, CPx).T, solved(S_z[k], HPz).T
-        nu[k] = r - times(H, z[k])
-        x1[k], Px1[k] = x[k] + times(Kx, r), symmetric(Px[k] - product(Kx, CPx))
-        z1[k], Pz1[k] = z[k] + times(Kz, nu[k]), symmetric(Pz[k] - product(Kz, HPz))
-        V1[k] = V[k] - product(Kx, H)
+        for i in range(m):
+            r[i] = y[k, i] - inner(C[i], x[k])
+            count[k] += seen[k, i]
+            for j in range(m):
+                S[i, j] += R[i, j]
+        for i in range(m):
+            if not seen[k, i]:
+                r[i] = 0.0
+                for j in range(p):
+                    H[i, j] = 0.0
+                for j in range(n_x):
+                    CPx[i, j] = 0.0
+                for j in range(m):
+                    S[i, j] = S[j, i] = 0.0
+                S[i, i] = 1.0
+        product(H, Pz[k], HPz)
+        product_with_transposed(HPz, H, S_z[k])
+        for i in range(m):
+            nu[k, i] = r[i] - inner(H[i], z[k])
+            for j in range(m):
+                S_z[k, i, j] += S[i, j]
+                a[i, j] = S_z[k, i, j]
+            for j in range(p):
+                Kz[i, j] = HPz[i, j]
+            for j in range(n_x):
+                Kx[i, j] = CPx[i, j]
+        eliminate(S, Kx)
+        eliminate(a, Kz)
+        corrected(x[k], Px[k], Kx, r, CPx, x1[k], Px1[k])
+        corrected(z[k], Pz[k], Kz, nu[k], HPz, z1[k], Pz1[k])
+        product_of_transposed(Kx, H, V1[k])
+        for i in range(n_x):
+            for j in range(p):
+                V1[k, i, j] = V[k, i, j] - V1[k, i, j]
 
 
 @compiled(void(M, M3, M, M3, M3, M, M3))
 def optimal(x, Px, z, Pz, V, X, P):
     """The optimal state estimate x + V z and its covariance Px + V Pz V', eqs. 40 and 41."""
-    for k in range(len(x)):
-        X[k] = x[k] + times(V[k], z[k])
-        P[k] = Px[k] + product(product(V[k], Pz[k]), V[k].T)
+    n, n_x, p = V.shape
+    VPz = np.empty((n_x, p))
+    for k in range(n):
+        product(V[k], Pz[k], VPz)
+        product_with_transposed(VPz, V[k], P[k])
+        for i in range(n_x):
+            X[k, i] = x[k, i] + inner(V[k, i], z[k])
+            for j in range(n_x):
+                P[k, i, j] += Px[k, i, j]

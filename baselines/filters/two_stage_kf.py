@@ -96,7 +96,7 @@ def predict(s: TwoStage, u: Array, model: LinearModel, Q: Array, Pz_minus: Array
 
 def correct(s: TwoStage, y: Array, seen: Array, C: Array, R: Array) -> TwoStage:
     """With the measurement y_{k+1} of the sensors that reported (n, n_y), eqs. 32 to 41."""
-    new = TwoStage(*(np.empty(a.shape, a.dtype) for a in s))
+    new = TwoStage(*map(np.empty_like, s))
     kernels.correct(s.x, s.Px, s.z, s.Pz, s.V, y, seen, C, contiguous(R), *new)
     return new
 
@@ -176,10 +176,12 @@ def initial_covariances(plant: Plant) -> tuple[Array, Array]:
     return 0.01 * np.eye(len(plant.states)), np.diag([4.0 if s.unit else 1.0 for s in plant.theta])
 
 
-@diagnoser("two_stage_kf", "Two-stage Kalman filter, constant bias")
+@diagnoser("two_stage_kf", "Two-stage Kalman filter, constant bias", reference=True)
 @diagnoser("two_stage_kf_random_walk", "Two-stage Kalman filter, random-walk bias", q_bias=1e-4)
 @diagnoser("two_stage_kf_directional", "Two-stage Kalman filter, directional forgetting", forgetting="directional")
-@diagnoser("two_stage_kf_exponential", "Two-stage Kalman filter, exponential forgetting", forgetting="exponential")
+@diagnoser(
+    "two_stage_kf_exponential", "Two-stage Kalman filter, exponential forgetting", reference=True, forgetting="exponential"
+)
 @diagnoser("two_stage_kf_exponential_fast", "The same, forgetting 0.96 and quick decisions: for intermittent faults",
            forgetting="exponential", factor=0.96, threshold=3.0, release_after=10)  # fmt: skip
 @diagnoser("two_stage_kf_thresholds", "Two-stage Kalman filter, directional forgetting, fixed thresholds",

@@ -16,9 +16,12 @@ from fdi_gym.diagnosis import Diagnoser, diagnoser, trainer
 from fdi_gym.plant import Plant
 
 
-@diagnoser("ppo", "PPO on features of an identified model, delay-aware reward", method="ppo")
+@diagnoser("ppo", "PPO on features of an identified model, delay-aware reward", sensors=True, method="ppo")
 @diagnoser(
-    "ppo_identification", "PPO on features of an identified model, for the fault parameters", method="ppo_identification"
+    "ppo_identification",
+    "PPO on features of an identified model, for the fault parameters",
+    sensors=True,
+    method="ppo_identification",
 )
 def ppo(plant: Plant, *, method: str = "ppo", path: str = "") -> Diagnoser:
     """The trained policy.

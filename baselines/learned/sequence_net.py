@@ -29,8 +29,8 @@ REACH = 10.0  # trust in filters is learned so many times faster than the rest: 
 LOG_STD = (-6.0, 3.0)  # bounds of the estimate's log standard deviation
 
 
-@diagnoser("sequence_net", "Recurrent network on observations, supervised", method="sequence_net")
-@diagnoser("residual_net", "Recurrent network that is shown filters too, supervised", method="residual_net")
+@diagnoser("sequence_net", "Recurrent network on observations, supervised", sensors=True, method="sequence_net")
+@diagnoser("residual_net", "Recurrent network that is shown filters too, supervised", sensors=True, method="residual_net")
 def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "standard", path: str = "") -> Diagnoser:
     """The trained network.
 

@@ -34,6 +34,21 @@ class Told(NamedTuple):
     now: Array  # (n,) bool: a fault acts
 
 
+def label_changes(plant: Plant, scenarios: Sequence[FaultScenario], n: int) -> tuple[Array, Array]:
+    """Where the label of n flights changes, and where a fault acts: (n, K + 1) bool each.
+
+    Raises:
+        ValueError: There are other than n scenarios.
+    """
+    if n != len(scenarios):
+        raise ValueError(f"the oracle was told of {len(scenarios)} flights, not {n}")
+    label = np.zeros((n, 1 + max((scenario.steps for scenario in scenarios), default=0)), np.int64)
+    for row, scenario in zip(label, scenarios, strict=True):
+        rows = plant.label_rows(scenario)
+        row[: len(rows)], row[len(rows) :] = rows, rows[-1]
+    return np.column_stack([np.zeros(n, bool), np.diff(label, axis=1) != 0]), label > 0
+
+
 @diagnoser(
     "told_onset_ekf",
     "Augmented EKF, told when the label changes; for any plant",
@@ -57,14 +72,8 @@ def told_onset_ekf(plant: Plant, belief: Belief, *, scenarios: Sequence[FaultSce
     extra = PER_FAULT * np.array([len(label.modes) for label in plant.labels])
 
     def start(n: int) -> Told:
-        if n != len(scenarios):
-            raise ValueError(f"the oracle was told of {len(scenarios)} flights, not {n}")
-        label = np.zeros((n, 1 + max((scenario.steps for scenario in scenarios), default=0)), np.int64)
-        for row, scenario in zip(label, scenarios, strict=True):
-            rows = plant.label_rows(scenario)
-            row[: len(rows)], row[len(rows) :] = rows, rows[-1]
-        changes = np.column_stack([np.zeros(n, bool), np.diff(label, axis=1) != 0])
-        return Told(plain.start(n), changes, label > 0, np.zeros(n, bool))
+        changes, acts = label_changes(plant, scenarios, n)
+        return Told(plain.start(n), changes, acts, np.zeros(n, bool))
 
     def predict(s: Told, at: Interval) -> Told:
         rows, k = np.arange(len(at.k)), np.minimum(at.k, s.acts.shape[1] - 1)

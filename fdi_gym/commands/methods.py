@@ -20,19 +20,19 @@ def fit(
 
     Args:
         plant: Plant or environment id; "module:id" where the module registers it.
-        diagnosers: Names; "all" for every one that takes any. What the file holds of others stays where names are given, as
-            long as the plant's code is the one that it is of.
+        diagnosers: Names; "reference" for those that others are compared with first, "all" for every one that takes any.
+            What the file holds of others stays where names are given, as long as the plant's code is the one that it is of.
         jobs: Worker processes, -1 for one per core.
         output: Folder that gets PLANT.json. Default: `fits` in the package of the methods, whence they are read.
     """
-    from fdi_gym.diagnosis import diagnosers as known
-    from fdi_gym.diagnosis import find_diagnoser, knowledge
+    from fdi_gym.diagnosis import find_diagnoser, knowledge, named
     from fdi_gym.listing import find_plant
     from fdi_gym.suite import load_suite, suite_names
 
     plant_id = find_plant(plant)[1]
-    names = list(known()) if diagnosers == ("all",) else list(dict.fromkeys(diagnosers))
-    entries = [entry for entry in map(find_diagnoser, names) if entry.takes("belief") or entry.takes("calibration")]
+    entries = [
+        entry for entry in map(find_diagnoser, named(diagnosers)) if entry.takes("belief") or entry.takes("calibration")
+    ]
     suites = [suite for suite in map(load_suite, suite_names()) if suite.plant == plant_id]
     if not entries or not suites:
         raise ValueError(f"nothing to fit: {len(suites)} suites of {plant_id}, {len(entries)} methods that take a belief")

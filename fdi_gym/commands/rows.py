@@ -1,19 +1,35 @@
-"""Rows and their pages: evaluate, verify, leaderboard."""
+"""Rows: evaluate, verify."""
 
 from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import tyro
 
-from fdi_gym.commands.arguments import WIDTH, Names, SuiteName
+from fdi_gym.commands.arguments import WIDTH, Names, SuiteNames
+
+if TYPE_CHECKING:
+    from fdi_gym.plant import Plant
+    from fdi_gym.suite import AnySuite
+
+
+class _Asked(NamedTuple):
+    """What is to be evaluated: a suite, as it was named, and the diagnosers that can run on it."""
+
+    name: str
+    suite: AnySuite
+    plant: Plant
+    names: list[str]
 
 
 def evaluate(
-    suite: SuiteName,
-    diagnosers: Names = ("all",),
+    suites: SuiteNames,
+    diagnosers: Names = ("reference",),
     results: Path | None = None,
     work: Path = Path("runs"),
     jobs: int = -1,
@@ -23,57 +39,84 @@ def evaluate(
     episodes: int | None = None,
     replace: bool = False,
 ) -> None:
-    """Run diagnosers on a suite, print the comparison table, and write one row per diagnoser.
+    """Run diagnosers on suites, print the comparison table of each, and write one row per diagnoser and suite.
 
     Args:
-        suite: Name of a suite, or path of a suite file.
-        diagnosers: Names; "all" for every one that can run on the suite's plant; "module:function" for your own.
-        results: Folder for the rows; without it nothing but the table is made.
+        suites: Names of suites, or paths of suite files; "all" for every one that is here.
+        diagnosers: Names; "reference" for those that others are compared with first, "all" for every one, of which those
+            run that can on the suite's plant; "module:function" for your own.
+        results: Folder for the rows, written as soon as a suite is finished; without it nothing but the tables is made.
         work: Folder of finished blocks. A killed run goes on from there.
         jobs: Worker processes, -1 for one per core.
         confusion: Whose confusion matrices to print.
         columns: One table of these columns in place of the three rankings; a wrong one lists them.
         csv: A file for all figures, comma-separated.
-        episodes: A quick look: so many of the flights, evenly spread. Makes no rows.
+        episodes: A quick look: so many of the flights of each suite, evenly spread. Makes no rows.
         replace: Rows in the folder that other sources, settings or data have made may go.
     """
     from fdi_gym import evaluation, leaderboard, row, tables
-    from fdi_gym.diagnosis import diagnosers as known
     from fdi_gym.files import write_whole
     from fdi_gym.names import unknown
-    from fdi_gym.suite import load_suite
 
     for column in columns:
         if column not in tables.COLUMNS:
             raise unknown("column", column, tables.COLUMNS)
     if episodes is not None and results is not None:
         raise ValueError("rows are made of the whole suite: --results and --episodes don't go together")
-    frozen = load_suite(suite)
-    frozen = frozen if episodes is None else frozen.head(episodes)
-    plant = frozen.build()
-    names = list(known()) if diagnosers == ("all",) else list(dict.fromkeys(diagnosers))
-    names, reasons = evaluation.applicable(frozen, plant, names)
-    for name, reason in reasons.items():
-        print(f"{name}: not applicable: {reason}", file=sys.stderr)
-    if not names:
-        raise ValueError(f"none of these diagnosers can run on {frozen.plant}")
+    asked = _asked(suites, diagnosers, episodes)
     if results is not None:
-        row.check_writable(results, frozen, {name: evaluation.digests_of(frozen, plant, name) for name in names}, replace)
-    command = f"fdi-gym evaluate {suite} --diagnosers {' '.join(names)}"
-    found = evaluation.evaluate(frozen, names, work=work, jobs=jobs, command=command)
-    rows = [f.row for f in found.values()]
-    times = {name: f.made.microseconds for name, f in found.items()}
-    board = leaderboard.Board(frozen, plant, rows, {name: f.outcomes for name, f in found.items()}, times)
-    print(f"\n{frozen.name}: {frozen.description}\n\n{leaderboard.tables(board, columns, WIDTH)}")
-    ranked, best = tables.by_isolation(rows), board.best()
-    for shown in {"best": [best] if best else [], "all": ranked, "none": []}[confusion]:
-        print(f"\n{tables.confusion_table(shown, [label.name for label in plant.labels], WIDTH)}")
+        for _, suite, plant, names in asked:
+            row.check_writable(results, suite, names, partial(evaluation.digests_of, suite, plant), replace)
+    lines, every, times = [], [], {}
+    for said, suite, plant, names in asked:
+        begun = time.monotonic()
+        command = f"fdi-gym evaluate {said} --diagnosers {' '.join(names)}"
+        found = evaluation.evaluate(suite, names, work=work, jobs=jobs, command=command)
+        rows = [f.row for f in found.values()]
+        mine = {name: f.made.microseconds for name, f in found.items()}
+        board = leaderboard.Board(suite, plant, rows, {name: f.outcomes for name, f in found.items()}, mine)
+        print(f"\n{suite.name}: {suite.description}\n\n{leaderboard.tables(board, columns, WIDTH)}")
+        ranked, best = tables.by_isolation(rows), board.best()
+        for shown in {"best": [best] if best else [], "all": ranked, "none": []}[confusion]:
+            print(f"\n{tables.confusion_table(shown, [label.name for label in plant.labels], WIDTH)}")
+        if csv is not None:
+            every += rows
+            times |= {(suite.name, name): microseconds for name, microseconds in mine.items()}
+            write_whole(csv, tables.comma_separated(every, times).encode())
+        if results is not None:
+            row.write_rows(results, suite, found)
+        place = f" in {results / suite.name}" if results is not None else ""
+        lines.append(f"{suite.name}: {len(rows)} rows{place}, {time.monotonic() - begun:.0f} s")
+        print(f"\n{lines[-1]}", flush=True)
     if csv is not None:
-        write_whole(csv, tables.comma_separated(rows, times).encode())
         print(f"\nall figures in {csv}")
-    if results is not None:
-        row.write_rows(results, frozen, found)
-        print(f"\n{len(rows)} rows in {results / frozen.name}")
+    if len(lines) > 1:
+        print("\n" + "\n".join(lines))
+
+
+def _asked(suites: Sequence[str], diagnosers: Sequence[str], episodes: int | None) -> list[_Asked]:
+    """What names of suites and of diagnosers stand for; what cannot run is said, before anything runs."""
+    from fdi_gym import evaluation
+    from fdi_gym.diagnosis import named
+    from fdi_gym.suite import load_suite, suite_names
+
+    loaded = {name: load_suite(name) for name in (suite_names() if "all" in suites else suites)}
+    if not loaded:
+        raise ValueError(f"evaluate a suite, or all; there are {', '.join(suite_names())}")
+    names, asked = named(diagnosers), []
+    for said, suite in loaded.items():
+        suite = suite if episodes is None else suite.head(episodes)
+        plant = suite.build()
+        able, reasons = evaluation.applicable(suite, plant, names)
+        for name, reason in reasons.items():
+            print(f"{suite.name}: {name}: not applicable: {reason}", file=sys.stderr)
+        if able:
+            asked.append(_Asked(said, suite, plant, able))
+    if not asked:
+        raise ValueError(
+            f"none of these diagnosers can run on {' or '.join(sorted({suite.plant for suite in loaded.values()}))}"
+        )
+    return asked
 
 
 def verify(
@@ -82,6 +125,8 @@ def verify(
     seed: int | None = None,
     suite: Annotated[str, tyro.conf.arg(metavar="SUITE")] = "",
     trust: Names = (),
+    renew: bool = False,
+    jobs: int = -1,
 ) -> None:
     """Check all that rows say against their episodes and the code that is here, and run a share of the episodes again.
 
@@ -89,33 +134,34 @@ def verify(
         rows: Row files; their outcomes lie beside them.
         share: Share of each row's episodes to run again, above 0 and up to 1.
         seed: Draws which ones; without it nobody can know beforehand.
-        suite: Name of a suite, or path of a suite file. Default: the one that the row names.
+        suite: Name of a suite, or path of a suite file. Default: the one that each row names.
         trust: Diagnosers "module:function" that may be imported. Look at their code first.
+        renew: Sources have changed, outcomes have not: rows that hold but for the digests of what made them get those of
+            what is here. A row that fails, or that the code no longer gives, stays as it is.
+        jobs: Worker processes, -1 for one per core.
     """
+    from fdi_gym.names import in_a_line
     from fdi_gym.row import MADE
-    from fdi_gym.verification import verify as check
+    from fdi_gym.verification import Verified, verify_all
 
     rows = tuple(path for path in rows if path.name != MADE)  # so that *.json will do
     if not rows:
         raise ValueError("there are no rows to verify")
-    for path in rows:
-        episodes = check(path, share, seed=seed, suite=suite, trust=trust)
-        print(f"{path}: every figure follows from the episodes; {len(episodes)} run again, same outcomes: {episodes}")
-
-
-def render(results: Path = Path("leaderboards/results"), pages: Path = Path("leaderboards"), pictures: bool = True) -> None:
-    """Render the tables of all rows: README.md, a page for each suite, and their pictures.
-
-    Args:
-        results: Folder of the rows.
-        pages: Folder of the pages.
-        pictures: Draw the pictures, too.
-    """
-    from fdi_gym import leaderboard
-    from fdi_gym.files import write_whole
-
-    for name, text in leaderboard.render(results).items():
-        write_whole(pages / name, text.encode())
-        print(pages / name)
-    for board in leaderboard.boards(results) if pictures else ():
-        leaderboard.draw(board, pages / "pictures")
+    refused, renewed = [], 0
+    for path, found in verify_all(rows, share, seed=seed, jobs=jobs, suite=suite, trust=trust, renew=renew):
+        if isinstance(found, Verified):
+            renewed += bool(found.renewed)
+            anew = f"; digests made anew: {', '.join(found.renewed)}" if found.renewed else ""
+            again = f"{len(found.episodes)} run again, same outcomes: {found.episodes}"
+            print(f"{path}: every figure follows from the episodes; {again}{anew}", flush=True)
+        elif len(rows) == 1:
+            raise found
+        else:
+            refused.append(path)
+            print(f"{path}: refused: {in_a_line(found)}", file=sys.stderr, flush=True)
+    if refused:
+        raise ValueError(
+            f"{len(refused)} of {len(rows)} rows are refused, {renewed} renewed: {', '.join(map(str, refused))}"
+        )
+    if len(rows) > 1:
+        print(f"{len(rows)} rows hold, {renewed} of them renewed")

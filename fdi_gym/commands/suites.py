@@ -55,10 +55,10 @@ def freeze(
         options: Options of the plant, as name and value in turn.
         mismatch: Level of mismatch, from 0 to 1; without it what the process prescribes.
         settings: Tuning that belongs to the suite: {"diagnoser": {"keyword": value}}.
-        folder: Where the file goes; default: beside the other suites.
+        folder: Where the file goes. Default: beside the other suites for a plant of this package, else the current folder.
     """
     from fdi_gym.design import by_label
-    from fdi_gym.discovery import load_plant
+    from fdi_gym.discovery import load_plant, plant_sources
     from fdi_gym.files import decode
     from fdi_gym.listing import find_plant
     from fdi_gym.suite import SUITES, Suite, checked_options
@@ -75,4 +75,5 @@ def freeze(
     )  # fmt: skip
     if episodes is None:
         suite = by_label(suite, decisions, healthy, first_seed)
-    print(write(suite, folder or SUITES))
+    own = plant_sources()[plant_id].builder.startswith("fdi_gym.plants.")
+    print(write(suite, folder or (SUITES if own else Path())))

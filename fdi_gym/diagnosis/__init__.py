@@ -12,6 +12,7 @@ from fdi_gym.diagnosis.registry import (
     diagnosers,
     find_diagnoser,
     find_trainer,
+    named,
     trainer,
     trainers,
 )  # fmt: skip
@@ -20,5 +21,5 @@ from fdi_gym.plant import NotApplicableError
 __all__ = [
     "Decisions", "Diagnoser", "Diagnosis", "Entry", "Filter", "NotApplicableError",
     "broken_plugins", "diagnoser", "diagnoser_of", "diagnosers", "find_diagnoser", "find_trainer", "fit", "guarded",
-    "make_diagnoser", "run", "train", "trainer", "trainers",
+    "make_diagnoser", "named", "run", "train", "trainer", "trainers",
 ]  # fmt: skip

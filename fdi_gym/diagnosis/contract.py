@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi_gym.plant import Array
+from fdi_gym.plant import Array, Plant
 
 
 class Diagnosis(NamedTuple):
@@ -47,6 +47,22 @@ class Diagnoser(NamedTuple):
     gaps: bool = False
     filter: Any = None  # the `filtering.Filter` that it is made of, where it is
     rule: Any = None  # and the `estimation.decision.Rule`
+
+
+def widened(diagnoser: Diagnoser, plant: Plant, shown: Plant) -> Diagnoser:
+    """A diagnoser of a plant, on one with more labels and more to estimate behind its own: of those it knows nothing."""
+    more, labels = len(shown.estimated) - len(plant.estimated), len(shown.labels) - len(plant.labels)
+
+    def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
+        state, said = diagnoser.update(state, obs)
+        estimate, probs = said.estimate, said.label_probs
+        if estimate is not None:
+            estimate = np.concatenate([estimate, np.tile(shown.healthy[-more:], (len(estimate), 1))], axis=1)
+        if probs is not None:
+            probs = np.pad(probs, ((0, 0), (0, labels)))
+        return state, said._replace(estimate=estimate, estimate_std=None, label_probs=probs)
+
+    return Diagnoser(diagnoser.init, update, diagnoser.gaps)
 
 
 class Decisions(NamedTuple):

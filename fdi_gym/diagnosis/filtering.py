@@ -20,6 +20,7 @@ from fdi_gym.diagnosis.contract import Diagnoser, Diagnosis, among
 from fdi_gym.estimation.decision import Reading, Rule, Verdict
 from fdi_gym.estimation.equivalent import has_equivalents, nearest
 from fdi_gym.estimation.interval import Interval, held_command_covariance
+from fdi_gym.estimation.sensor_checks import Checks, SensorChecks
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, Plant
 
@@ -119,8 +120,39 @@ def shell(plant: Plant, filter: Filter, rule: Rule) -> tuple[Callable[[int], Run
     return start, step
 
 
+class Checked(NamedTuple):
+    """State of a filter whose sensors are checked."""
+
+    filter: Any
+    checks: Checks
+
+
+def checked(plant: Plant, filter: Filter) -> Filter:
+    """The filter, whose readings say too what its sensors show of their own faults."""
+    checks = SensorChecks(plant)
+
+    def update(s: Checked, at: Interval, y: Array, seen: Array) -> Checked:
+        state = filter.update(s.filter, at, y, seen)
+        return Checked(state, checks.update(s.checks, y, seen, filter.read(state)))
+
+    begin, expect = filter.begin, filter.expect
+    return filter._replace(
+        start=lambda n: Checked(filter.start(n), checks.start(n)),
+        predict=lambda s, at: s._replace(filter=filter.predict(s.filter, at)),
+        update=update,
+        read=lambda s: filter.read(s.filter)._replace(gain=checks.gain(s.checks)),
+        begin=None if begin is None else lambda s, at, y: s._replace(filter=begin(s.filter, at, y)),
+        expect=None if expect is None else lambda s, at: expect(s.filter, at),
+    )
+
+
 def diagnoser_of(plant: Plant, filter: Filter, rule: Rule) -> Diagnoser:
-    """The diagnoser that declares what a rule makes of a filter's readings."""
+    """The diagnoser that declares what a rule makes of a filter's readings.
+
+    Where the plant's sensors may fail, the rule hears `fdi_gym.estimation.sensor_checks` too.
+    """
+    if plant.bare is not None:
+        filter = checked(plant, filter)
     start, step = shell(plant, filter, rule)
     healthy = contiguous(plant.healthy)
 

@@ -8,7 +8,7 @@ Nothing of a test flight is used. `fdi_gym.diagnosis.knowledge` ships and keeps 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -89,6 +89,35 @@ def _magnitudes(plant: Plant, z: Array, record: Record, block: int) -> tuple[Arr
     return mean, std, walk
 
 
+class _Sizes(NamedTuple):
+    """What is found of the faults: of the entries of the fault vector (p,), and of the modes (modes,)."""
+
+    z_size: Array
+    z_walk: Array
+    m_mean: Array
+    m_std: Array
+    m_walk: Array
+
+
+def _alike(plant: Plant, bare: Plant, z: Array, flown: Array, block: int, s: _Sizes) -> _Sizes:
+    """The same, for biases of sensors: all of them as one, in the units of their scales, since a process draws each rarely.
+
+    z (N, K, estimated).
+    """
+    own, modes = len(bare.estimated), len(bare.modes)
+    units = np.array([e.scale for e in plant.estimated[own:]])
+    bias = z[..., own:] / units
+    values = np.abs(bias[bias != 0.0])
+    steps = np.sqrt(np.diag(long_run(np.diff(bias, axis=1), flown, block)).mean())
+    walk = steps if steps > 0 else 0.02
+    of_mode = np.array([units[np.argmax(mode.direction[own:])] for mode in plant.modes[modes:]])
+    std = float(np.sqrt((values**2).mean())) if values.size else 1.0
+    size = float(np.median(values)) if values.size else 1.0
+    more = (size * units, walk * units, 0.0 * of_mode, std * of_mode, walk * of_mode)
+    firsts = (own, own, modes, modes, modes)
+    return _Sizes(*(np.concatenate([a[:n], b]) for a, n, b in zip(s, firsts, more, strict=True)))
+
+
 def fit_belief(plant: Plant, process: str) -> Belief:
     """What the declarations of a plant and of one of its fault processes let a filter believe.
 
@@ -124,7 +153,9 @@ def fit_belief(plant: Plant, process: str) -> Belief:
     z_walk = np.sqrt(np.diag(long_run(np.diff(z, axis=1), flown, block)))
     z_walk = np.where(z_walk > 0, z_walk, 0.02 * size)
 
-    mean, std, m_walk = _magnitudes(plant, z, faulty, block)
+    sizes = _Sizes(size, z_walk, *_magnitudes(plant, z, faulty, block))
+    if plant.bare is not None:
+        sizes = _alike(plant, plant.bare, z, flown, block, sizes)
     changes = float(((np.diff(faulty.label, axis=1) != 0) & flown).sum() / flown.sum())
 
     d = np.zeros((FLIGHTS, K + 1, len(plant.disturbances)))
@@ -138,8 +169,8 @@ def fit_belief(plant: Plant, process: str) -> Belief:
     d_walk = np.sqrt(np.diag(long_run(np.diff(d, axis=1), valid, block)) + floor**2 / K)
     d0 = np.sqrt((d[:, 0] ** 2).mean(axis=0) + floor**2)
     found = {
-        "x0": plant.trim_state, "P0": P0, "Q": Q, "R": R, "z_size": size, "z_walk": z_walk, "m_mean": mean, "m_std": std,
-        "m_walk": m_walk, "changes": changes, "d0": d0, "d_walk": d_walk,
+        "x0": plant.trim_state, "P0": P0, "Q": Q, "R": R, **sizes._asdict(), "changes": changes, "d0": d0,
+        "d_walk": d_walk,
     }  # fmt: skip
     return Belief(sensors=sensors, disturbances=which, **{name: rounded(value) for name, value in found.items()})
 

@@ -118,8 +118,10 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
             )
         if n == 0:
             return state, last
-        shown = ~lost if raw.gaps else ~lost & np.isfinite(obs).all(axis=1)
-        whole = np.count_nonzero(shown) == n
+        shown, whole = ~lost, not np.count_nonzero(lost)
+        if not raw.gaps:
+            shown &= np.isfinite(obs).all(axis=1)
+            whole = bool(shown.all())
         if not whole:
             obs = np.where(shown[:, None], obs, last_obs)
         with np.errstate(all="ignore"):

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from fdi_gym.diagnosis import fitting
 from fdi_gym.diagnosis.fitting import fit_belief, fit_calibration
 from fdi_gym.diagnosis.registry import Entry, find_diagnoser, package_of
 from fdi_gym.discovery import plant_sources
@@ -28,7 +29,7 @@ from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.data import from_json, to_json
 from fdi_gym.files import write_whole
-from fdi_gym.kernels import cache_folder
+from fdi_gym.kernels import cache_folder, sources
 from fdi_gym.plant import NotApplicableError, Plant
 
 
@@ -90,10 +91,19 @@ def _known(entry: Entry, plant: Plant, kind: str, key: str, make: Any) -> Any:
         found = getattr(shipped, kind).get(key)
         if found is not None:
             return found
-    place = f"{plant.env_id} {code} {kind} {key}"
+    place = f"{plant.env_id} {code} {kind} {key} {_fitting()}"
     if place not in _kept:
         _kept[place] = _on_disk(entry, place, Belief if kind == "beliefs" else Calibration, make)
     return _kept[place]
+
+
+@functools.cache
+def _fitting() -> str:
+    """Digest of the sources that find a fit, beside the method's and the plant's."""
+    digest = hashlib.sha256()
+    for path in sources(Path(fitting.__file__)):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def _on_disk(entry: Entry, place: str, of: Any, make: Any) -> Any:
@@ -116,8 +126,18 @@ def _on_disk(entry: Entry, place: str, of: Any, make: Any) -> Any:
 
 
 def knowledge_of(entry: Entry, plant: Plant, process: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The belief and the calibration that a method's builder takes: shipped, or found now and kept for the session."""
+    """The belief and the calibration that a method's builder takes: shipped, or found now and kept for the session.
+
+    Nobody is told which samples go missing: what is known is that of sensors which report at every one.
+
+    Raises:
+        NotApplicableError: It takes some, and the plant has no equations from which they could be found.
+    """
     found: dict[str, Any] = {}
+    if plant.kernels is None and (entry.takes("belief") or entry.takes("calibration")):
+        raise NotApplicableError(f"needs equations; {plant.id} declares channels only")
+    plant, process = entry.told(plant, process)
+    plant = plant if plant.regular is None else plant.regular
     if entry.takes("belief"):
         found["belief"] = _known(entry, plant, "beliefs", belief_key(plant, process), lambda: fit_belief(plant, process))
     if entry.takes("calibration"):
@@ -166,8 +186,11 @@ def fit_suites(entries: Sequence[Entry], suites: Sequence[Any], jobs: int = -1) 
 
     tasks: dict[str, Task] = {}
     for suite in suites:
-        plant = suite.build()
+        built = suite.build()
         for entry in entries:
+            if built.bare is not None and not entry.hears_sensors:
+                continue  # it knows what it knows of the plant without
+            plant = built if built.regular is None else built.regular
             settings = entry.resolve(plant, **suite.settings.get(entry.name, {}))
             key = calibration_key(entry, plant, suite.process, settings)
             tasks[key] = Task(entry, plant, suite.process, settings)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fdi_gym.diagnosis.contract import Diagnoser
+from fdi_gym.diagnosis.contract import Diagnoser, widened
 from fdi_gym.diagnosis.guard import guarded
 from fdi_gym.diagnosis.knowledge import knowledge_of
 from fdi_gym.diagnosis.registry import find_diagnoser, find_trainer
@@ -37,11 +37,12 @@ def make_diagnoser(
     """
     entry = find_diagnoser(name)
     plant.process(process)
+    shown, (plant, process) = plant, entry.told(plant, process)
     settings = entry.resolve(plant, **tuning)
     given: dict[str, Any] = {"process": process} if entry.takes("process") else {}
     if entry.clairvoyant:
         if scenarios is None:
-            raise ValueError(f"{name} knows the truth: it needs scenarios, one per episode")
+            raise NotApplicableError(f"{name} knows the truth: it needs scenarios, one per episode")
         given["scenarios"] = scenarios
     try:
         given |= knowledge_of(entry, plant, process, settings)
@@ -54,7 +55,7 @@ def make_diagnoser(
         raise ValueError(f"the builder of {name} failed: {blame(error)}") from error
     if not isinstance(built, Diagnoser):
         raise ValueError(f"the builder of {name} gives {type(built).__name__}, not a Diagnoser")
-    return guarded(built, plant)
+    return guarded(built if plant is shown else widened(built, plant, shown), shown)
 
 
 def train(

@@ -26,13 +26,13 @@ import importlib
 import inspect
 import json
 import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from fdi_gym.names import blame, check_diagnoser_name, find_function, unknown
-from fdi_gym.plant import Plant
+from fdi_gym.plant import NotApplicableError, Plant
 
 Kind = Literal["diagnoser", "trainer"]
 GIVEN: dict[Kind, dict[str, str]] = {  # arguments that are no settings
@@ -61,6 +61,25 @@ class Entry(NamedTuple):
     settings: Mapping[str, Any]  # that belong to the name
     knows: str = ""  # of the truth, in words; empty for a method that is told nothing
     ceiling: bool = False  # what it knows is more than any method can find out: it frames a table
+    reference: bool = False  # others are compared with it first: in the group "reference", as ceilings are
+    sensors: bool | None = None  # it goes by the plant's declaration, faults of sensors included
+
+    @property
+    def hears_sensors(self) -> bool:
+        """Whether it is told that sensors may fail: what takes a belief is, if it does not say otherwise."""
+        return self.takes("belief") if self.sensors is None else self.sensors
+
+    def told(self, plant: Plant, process: str) -> tuple[Plant, str]:
+        """The plant and the process as the method knows them: that of other methods has sensors that never fail.
+
+        Raises:
+            NotApplicableError: It knows a part of the truth, but not of sensors that fail.
+        """
+        if plant.bare is None or self.hears_sensors:
+            return plant, process
+        if self.clairvoyant:
+            raise NotApplicableError(f"what {self.name} is told of the truth does not cover faults of sensors")
+        return plant.bare, process if process in plant.bare.processes else "standard"
 
     @property
     def clairvoyant(self) -> bool:
@@ -127,10 +146,23 @@ def paper_tuning(entry: Entry, plant: Plant, asked: Mapping[str, Any]) -> dict[s
     return found
 
 
+GROUPS: dict[str, Callable[[Entry], bool]] = {
+    "all": lambda entry: True,
+    "reference": lambda entry: entry.reference or entry.ceiling,
+}
 _entries: dict[Kind, dict[str, Entry]] = {"diagnoser": {}, "trainer": {}}
 
 
-def diagnoser(name: str, summary: str, *, knows: str = "", ceiling: bool = False, **settings: Any) -> Callable[[Any], Any]:
+def diagnoser(
+    name: str,
+    summary: str,
+    *,
+    knows: str = "",
+    ceiling: bool = False,
+    reference: bool = False,
+    sensors: bool | None = None,
+    **settings: Any,
+) -> Callable[[Any], Any]:
     """Make a builder known under a name. Stacked, it gives one builder several names with different settings.
 
     Args:
@@ -139,14 +171,17 @@ def diagnoser(name: str, summary: str, *, knows: str = "", ceiling: bool = False
         knows: What it is told of the truth, in a few words for tables ("when faults begin and end"): its builder takes
             `scenarios=`, one per episode.
         ceiling: No method that is told nothing can be better, as far as is known: it frames the tables.
+        reference: One of those that others are compared with first.
+        sensors: Of a plant whose sensors may fail it gets that plant; others get the same without, and are not told.
+            Default: whether it takes a belief.
         settings: Keyword arguments of the builder that belong to this name.
 
     Raises:
-        ValueError: The name is taken, the builder has no such keyword, or a ceiling that knows nothing.
+        ValueError: The name is taken or a group's, the builder has no such keyword, or a ceiling that knows nothing.
     """
     if ceiling and not knows:
         raise ValueError(f"{name} is called a ceiling, but knows nothing of the truth")
-    return functools.partial(_register, "diagnoser", name, summary, settings, knows, ceiling)
+    return functools.partial(_register, "diagnoser", name, summary, settings, (knows, ceiling, reference, sensors))
 
 
 def trainer(name: str, summary: str, **settings: Any) -> Callable[[Any], Any]:
@@ -155,7 +190,7 @@ def trainer(name: str, summary: str, **settings: Any) -> Callable[[Any], Any]:
     Raises:
         ValueError: As there.
     """
-    return functools.partial(_register, "trainer", name, summary, settings, "", False)
+    return functools.partial(_register, "trainer", name, summary, settings, ())
 
 
 def _register(
@@ -163,10 +198,11 @@ def _register(
     name: str,
     summary: str,
     settings: Mapping[str, Any],
-    knows: str,
-    ceiling: bool,
+    facts: tuple[Any, ...],
     build: Callable[..., Any],
 ) -> Callable[..., Any]:
+    if name in GROUPS:
+        raise ValueError(f"{name!r} is a group of diagnosers, and cannot be the name of one")
     taken = _entries[kind].get(name)
     if taken is not None and (taken.build.__module__, taken.build.__qualname__) != (build.__module__, build.__qualname__):
         raise ValueError(f"two {kind}s are called {name!r}: {taken.build.__module__} and {build.__module__}")
@@ -174,7 +210,7 @@ def _register(
     for setting in settings:
         if setting not in allowed:
             raise ValueError(f"{build.__name__} has no setting {setting!r}; it has {', '.join(allowed)}")
-    _entries[kind][name] = Entry(kind, name, summary, build, settings, knows, ceiling)
+    _entries[kind][name] = Entry(kind, name, summary, build, settings, *facts)
     return build
 
 
@@ -211,6 +247,15 @@ def diagnosers() -> dict[str, Entry]:
 def trainers() -> dict[str, Entry]:
     """All trainers by name, in the order in which their modules declare them."""
     return _known("trainer")
+
+
+def named(names: Iterable[str]) -> list[str]:
+    """These names, each once, with the diagnosers of a group (`GROUPS`) in its place."""
+    found: list[str] = []
+    for name in names:
+        belongs = GROUPS.get(name)
+        found += [name] if belongs is None else [entry.name for entry in diagnosers().values() if belongs(entry)]
+    return list(dict.fromkeys(found))
 
 
 def _find(kind: Kind, name: str) -> Entry:

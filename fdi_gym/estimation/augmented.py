@@ -103,11 +103,16 @@ class AugmentedModel:
         t = NO_TIME if model.linear.size else (at.k - 1) * self.plant.dt
         return gaussian.predict(model, rule, X, P, t, at.u, at.d, Q)
 
-    def update(self, rule: str, X: Array, P: Array, at: Interval, y: Array, seen: Array) -> gaussian.Updated:
-        """Update with the measurement y (n, n_y) of the sensors that reported, seen (n, n_y)."""
+    def update(
+        self, rule: str, X: Array, P: Array, at: Interval, y: Array, seen: Array, R: Array | None = None
+    ) -> gaussian.Updated:
+        """Update with the measurement y (n, n_y) of the sensors that reported, seen (n, n_y).
+
+        R (r, m, m) serves the rows of X in turn. Default: the model's, for all.
+        """
         if not self.hears_all:
             y, seen = y.take(self.sensors, axis=1), seen.take(self.sensors, axis=1)
-        model, (_, R) = self.compiled, self.noises
+        model, R = self.compiled, self.noises[1] if R is None else R
         t = NO_TIME if model.H.size else at.k * self.plant.dt
         return gaussian.update(model, rule, X, P, t, at.u, at.d, y, seen, R)
 

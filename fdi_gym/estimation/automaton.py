@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import boolean, int64, void
 
-from fdi_gym.estimation.compiled import helper
-from fdi_gym.kernels import compiled
+from fdi_gym.kernels import compiled, helper
 from fdi_gym.plant import Array
 
 I1, B1 = int64[::1], boolean[::1]

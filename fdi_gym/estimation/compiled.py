@@ -1,12 +1,9 @@
 """Small linear algebra for many systems at once, compiled: what NumPy's stacked routines do too slowly or not at all."""
 
-import numba
 import numpy as np
 from numba import float64, void
 
-from fdi_gym.kernels import compiled
-
-helper = numba.njit(error_model="numpy")
+from fdi_gym.kernels import compiled, helper
 
 
 @helper

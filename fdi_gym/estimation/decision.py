@@ -13,7 +13,8 @@ A rule is a pair of functions, `start(n)` and `step(state, k, reading, informed)
 
 `fdi_gym.estimation.channels` has one for filters whose estimate has an entry for each fault.
 
-A sample at which no sensor reported says nothing, and no counter moves.
+A sample at which no sensor reported says nothing, and no counter moves. After a gap `by_labels` waits until the estimate is
+about as sure as before it: what a held command did to it while nothing was measured is no evidence of a fault.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from fdi_gym.estimation import label_kernels
 from fdi_gym.estimation.automaton import Automaton, first, step
 from fdi_gym.estimation.calibration import LEAST, Calibration, Persistence
 from fdi_gym.estimation.kalman import quadratic
-from fdi_gym.estimation.labels import manifolds
+from fdi_gym.estimation.labels import distances, manifolds
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, Plant
 
@@ -46,6 +47,7 @@ class Reading(NamedTuple):
     probs: Array | None = None  # (n, labels)
     signals: dict[str, Array] | None = None  # (n, ...) each
     span: Array | None = None  # (n,) samples over which z is the mean, where that is not 1
+    gain: Array | None = None  # (n, labels) by how much labels fit better than healthy for reasons that are no line
 
 
 class Evidence(NamedTuple):
@@ -163,11 +165,26 @@ def glr(windows: tuple[int, ...] = (2, 5, 10, 20, 40)) -> Statistic:
 
 STATISTICS: dict[str, Callable[[], Statistic]] = {"chi-square": chi_square, "cusum": cusum, "glr": glr}
 DECISIONS = ("distance", "thresholds", *STATISTICS)
+SURE_AGAIN = 1.2  # times the variance before a gap
 QUARTER = 0.25  # of a typical fault: what LEAST is in the fixed metric of "thresholds"
 
 
 # ---------------------------------------------------------------------------------------------------------------
 # Rules
+
+
+class Waiting(NamedTuple):
+    """For an estimate that is as sure again as it was before a gap."""
+
+    still: Array  # (n,) bool
+    variance: Array  # (n, p) of the estimate when a sensor last reported and nothing was waited for
+
+    def after(self, informed: Array, variance: Array) -> Waiting:
+        """After a sample at which sensors reported or did not."""
+        if informed.all() and not self.still.any():
+            return Waiting(self.still, variance)
+        still = ~informed | (self.still & (variance > SURE_AGAIN * self.variance).any(axis=1))
+        return Waiting(still, np.where(still[:, None], self.variance, variance))
 
 
 def by_labels(
@@ -201,12 +218,23 @@ def by_labels(
     lengths = np.array([after.rise, after.switch, after.release, after.same, after.warmup], np.int64)
     none, labels, (h, _, f) = np.zeros(0), len(plant.labels), sets.direction.shape
 
-    def start(n: int) -> Any:
-        return np.zeros((n, 5), np.int64), None  # the automata, and the statistic
+    def start(n: int) -> Any:  # the automata, the statistic, and what is waited for
+        return np.zeros((n, 5), np.int64), None, Waiting(np.zeros(n, bool), np.full((n, p), np.inf))
+
+    def costs(r: Reading) -> tuple[Array, Array]:
+        assert r.z is not None
+        assert r.P is not None
+        J, at = distances(r.z, r.P if fixed is None else fixed, sets, excess)
+        cost = np.empty((len(r.z), labels))
+        cost[:, 0], cost[:, sets.labels] = J[:, 0], J[:, 1:]
+        return cost, at
 
     def step(state: Any, k: Array, r: Reading, informed: Array) -> tuple[Any, Verdict]:
-        declared, tested = state
+        declared, tested, waiting = state
         n, rise = len(k), None
+        if r.P is not None:
+            waiting = waiting.after(informed, np.diagonal(r.P, axis1=1, axis2=2))
+            informed = informed & ~waiting.still
         if statistic is not None:
             tested = statistic.start(n, r.nu.shape[1] if r.nu is not None else m) if tested is None else tested
             tested, rise = statistic.step(tested, r, informed & (k > after.warmup))
@@ -215,8 +243,9 @@ def by_labels(
             penalty, none if rise is None else rise, limit, lengths, k, informed, declared, following, label, alarm,
         )  # fmt: skip
         z = None
-        if r.cost is not None:
-            cost = contiguous(r.cost)
+        if r.cost is not None or r.gain is not None:
+            cost, at = (r.cost, None) if r.cost is not None else costs(r)
+            cost = contiguous(cost if r.gain is None else np.where(r.gain > 0, np.minimum(cost, cost[:, :1] - r.gain), cost))
             label_kernels.declare(cost, *told)
         else:
             assert r.z is not None
@@ -224,9 +253,9 @@ def by_labels(
             P = contiguous(r.P) if fixed is None else fixed
             cost, at = np.empty((n, labels)), np.empty((n, h, f))
             label_kernels.judge(contiguous(r.z), P, excess, *sets, *told, cost, at)
-            if on_line:
-                z = (sets.points(at) * (sets.labels == label[:, None])[..., None]).sum(axis=1)
-        return (following, tested), Verdict(alarm, label, z, Evidence(cost, rise))
+        if on_line and at is not None:
+            z = (sets.points(at) * (sets.labels == label[:, None])[..., None]).sum(axis=1)
+        return (following, tested, waiting), Verdict(alarm, label, z, Evidence(cost, rise))
 
     return Rule(start, step)
 

@@ -8,13 +8,12 @@ from numba import boolean, float64, int64, void
 from fdi_gym.estimation.gaussian_moments import (
     SIZES,
     correct_episode,
-    helper,
     linearised,
     pass_points,
     through,
     through_matrix,
 )
-from fdi_gym.kernels import M, V, compiled
+from fdi_gym.kernels import M, V, compiled, helper
 
 I1, B2, M3 = int64[::1], boolean[:, ::1], float64[:, :, ::1]
 # integers, reals, step, offset, direction: the constants of a model that tell its f and h, as `gaussian.bind` packs them

@@ -80,7 +80,7 @@ def bind(
         raise ValueError(f"limit needs {N} numbers that are not negative, not {limit}")
     if H is not None and (observed.shape != (m, N) or not np.isfinite(observed).all()):
         raise ValueError(f"H needs the shape ({m}, {N}) and finite numbers, not {observed.shape}")
-    sizes = (plant.substeps, n_x, len(plant.outputs), n_theta, n_D, p, n_d, m, len(plant.commands))
+    sizes = (plant.substeps, n_x, len(plant.outputs), n_theta, n_D, p, n_d, m, plant.own_theta, len(plant.commands))
     integers = np.concatenate([[0, 0, 0, *sizes], *where.values()]).astype(np.int64)
     reals = np.concatenate([[plant.dt], plant.nominal_theta, plant.nominal_p])
     constants = (integers, reals, STEP * size, contiguous(offset), contiguous(direction))

@@ -17,18 +17,15 @@ in an order that no batch changes. Matrices are kept transposed (`first`, `cross
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from fdi_gym.integration import interval
-from fdi_gym.kernels import map_at, project_at
+from fdi_gym.kernels import helper, map_at, project_at
 
 EXTENDED, UNSCENTED, CENTRAL_DIFFERENCE = 0, 1, 2
 LOG_2PI = float(np.log(2.0 * np.pi))
 JITTER, RETRIES = 1e-14, 7  # added to the diagonal where the factorisation fails, times 100 at each retry
-SIZES = 12  # integers before the lists of positions
-
-helper = numba.njit(error_model="numpy")
+SIZES = 13  # integers before the lists of positions
 
 
 @helper
@@ -39,12 +36,13 @@ def pass_points(moving, integers, reals, offset, direction, t, points, u, known,
     """
     dynamics, output, project = map_at(integers[0]), map_at(integers[1]), project_at(integers[2])
     substeps, n_x, n_y, n_theta = integers[3], integers[4], integers[5], integers[6]
-    p, n_d, m = integers[8], integers[9], integers[10]
+    p, n_d, m, own = integers[8], integers[9], integers[10], integers[11]
     n_m = direction.shape[1]
     entries, rest = integers[SIZES : SIZES + p], integers[SIZES + p :]
     disturbances, sensors = rest[:n_d], rest[n_d:]
     dt, nominal, physical = reals[0], reals[1 : 1 + n_theta], reals[1 + n_theta :]
     x, y, theta, theta_now, still = np.empty(n_x), np.empty(n_y), np.empty(n_theta), np.empty(n_theta), np.zeros(n_theta)
+    theta_p, theta_now, still = theta[:own], theta_now[:own], still[:own]  # the rest are faults of the sensors
     d = known.copy()
     k1, k2, k3, k4, z = np.empty(n_x), np.empty(n_x), np.empty(n_x), np.empty(n_x), np.empty(n_x)
     for i in range(points.shape[0]):
@@ -61,13 +59,16 @@ def pass_points(moving, integers, reals, offset, direction, t, points, u, known,
             x[j] = points[i, j]
         if moving:
             interval(
-                dynamics, project, t, dt, substeps, x, u, False, theta, still, still, d, physical, theta_now,
+                dynamics, project, t, dt, substeps, x, u, False, theta_p, still, still, d, physical, theta_now,
                 k1, k2, k3, k4, z,
             )  # fmt: skip
             for j in range(n_x):
                 values[i, j] = x[j]
         else:
-            output(t, x, u, theta, d, physical, y)
+            output(t, x, u, theta_p, d, physical, y)
+            if own < n_theta:  # gains, then biases
+                for j in range(n_y):
+                    y[j] += y[j] * theta[own + j] + theta[own + n_y + j]
             for j in range(m):
                 values[i, j] = y[sensors[j]]
 

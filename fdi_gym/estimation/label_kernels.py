@@ -6,8 +6,8 @@ import numpy as np
 from numba import boolean, float64, int64, void
 
 from fdi_gym.estimation.automaton import advance
-from fdi_gym.estimation.compiled import box_minimum, eliminate, helper
-from fdi_gym.kernels import M, V, compiled
+from fdi_gym.estimation.compiled import box_minimum, eliminate
+from fdi_gym.kernels import M, V, compiled, helper
 
 I1, I2, B1, M3 = int64[::1], int64[:, ::1], boolean[::1], float64[:, :, ::1]
 SETS = (I1, M, M3, M, M)  # faults, offset, direction, low, high: of the sets, as in `labels.Manifolds`
@@ -143,9 +143,11 @@ def declare(cost, penalty, statistic, limit, after, k, informed, state, state1, 
     switch, release, same and warmup of a persistence.
     """
     for e in range(len(cost)):
-        state1[e] = state[e]
         if informed[e] and k[e] > after[4]:
             declared(cost[e], penalty, statistic[e : e + 1], limit, after, state[e], state1[e])
+        else:
+            for i in range(5):
+                state1[e, i] = state[e, i]
         label[e], alarm[e] = state1[e, 0], state1[e, 0] > 0
 
 
@@ -165,7 +167,9 @@ def judge(
         nearest_points(I, Iz, faults, offset, direction, low, high, J, m[e], work)
         for s in range(len(faults)):
             cost[e, labels[s]] = J[s] + cost[e, 0]
-        state1[e] = state[e]
         if informed[e] and k[e] > after[4]:
             declared(cost[e], penalty, statistic[e : e + 1], limit, after, state[e], state1[e])
+        else:
+            for i in range(5):
+                state1[e, i] = state[e, i]
         label[e], alarm[e] = state1[e, 0], state1[e, 0] > 0

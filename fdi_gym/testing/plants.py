@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fdi_gym.bounds import check_bounds_at
 from fdi_gym.checks import check_declaration
 from fdi_gym.engine import Record, no_noise, simulate
 from fdi_gym.faults import Fault, FaultScenario, Incipient, Intermittent, draw
@@ -18,7 +19,7 @@ def check_plant(plant: Plant, seeds: Sequence[int] = range(5)) -> None:
     Names are unique, scales positive, bands in order. Scenarios fit the plant, survive JSON and replay to the same
     flight. While modes are active, the estimated quantity is healthy plus a point of each mode's line, within its reach;
     theta, target and observations stay in their ranges; labels, target and theta agree. The healthy plant is what the
-    model predicts, and linear, and its disturbance measured, where it says so.
+    model predicts, and linear, and its disturbance measured, where it says so. The kernels stay within their arrays.
 
     Args:
         plant: The plant.
@@ -26,7 +27,8 @@ def check_plant(plant: Plant, seeds: Sequence[int] = range(5)) -> None:
 
     Raises:
         AssertionError: A law is broken; the message names it, and where.
-        ValueError: The declaration contradicts itself (as when it was made), or a drawn scenario does not fit.
+        ValueError: The declaration contradicts itself (as when it was made), a drawn scenario does not fit, or a kernel
+            reaches beyond its arrays.
     """
     check_declaration(plant)
     nominal = plant.nominal_theta
@@ -62,7 +64,16 @@ def _check_range(what: str, signals: Sequence[Signal], values: Array) -> None:
         )
 
 
+def _check_bounds(plant: Plant, record: Record) -> None:
+    """The kernels stay within their arrays at some samples of each flight."""
+    _, u, _ = plant.split(record.obs)
+    for i, last in enumerate(record.length.tolist()):
+        for k in range(0, last + 1, max(last // 8, 1)):
+            check_bounds_at(plant, k * plant.dt, record.state[i, k], u[i, k], record.theta[i, k])
+
+
 def _check_record(plant: Plant, name: str, scenarios: Sequence[FaultScenario], record: Record) -> None:
+    _check_bounds(plant, record)
     _check_range(f"{name}: the observation", plant.observed, record.obs)
     _check_range(f"{name}: theta's", plant.theta, record.theta)
     _check_range(f"{name}: the estimated", plant.estimated, record.target)

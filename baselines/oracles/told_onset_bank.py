@@ -1,0 +1,175 @@
+"""An oracle for any plant: an extended Kalman filter per hypothesis, told when the label changes, not to what.
+
+The hypotheses are those of the multiple models: each label with the magnitudes of its own faults. Where the plant's sensors
+may fail, each sensor has four: its bias, its gain (a line in theta beside the estimated space), and noise that has grown
+little or much. At a change all of them start from what the healthy filter knows, with the magnitudes' prior, and the label
+is the one whose likelihood since then is the largest on average over its hypotheses. While there is no fault that is known.
+
+On a plant whose linearisation is exact over the magnitudes this is the Bayes classifier within the known windows, up to
+the shape of the prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import logsumexp
+
+from baselines.filters.multiple_model import hypotheses
+from baselines.oracles.told_onset_ekf import label_changes
+from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
+from fdi_gym.estimation.augmented import AugmentedModel
+from fdi_gym.estimation.belief import Belief
+from fdi_gym.estimation.decision import Reading, by_candidate
+from fdi_gym.estimation.interval import Interval
+from fdi_gym.estimation.sensor_checks import Checks, SensorChecks
+from fdi_gym.faults import FaultScenario
+from fdi_gym.plant import Array, Plant
+from fdi_gym.sensors import GAIN, failing, sensor_mode
+
+GROWN = (3.0, 8.0)  # standard deviations of a noise that has grown, in units of the healthy one
+
+
+class Rows(NamedTuple):
+    """The hypotheses, stacked."""
+
+    model: AugmentedModel
+    label: Array  # (r,) of each
+    m0: Array  # (r, f) prior of its magnitudes
+    M0: Array  # (r, f, f)
+    R: Array  # (r, m, m) noise of its sensors
+    log_prior: Array  # (r,) within its label
+
+
+def rows(plant: Plant, belief: Belief) -> Rows:
+    """The hypotheses of a plant.
+
+    Raises:
+        NotApplicableError: The fault vector does not enter additively.
+    """
+    b = hypotheses(plant, belief)
+    model, labels = b.model, np.arange(len(b.m0))
+    assert model.lines is not None
+    if plant.bare is None:
+        R = np.tile(belief.R, (len(labels), 1, 1))
+        return Rows(model, labels, b.m0, b.M0, R, np.zeros(len(labels)))
+    offset, direction = model.lines
+    sensors = [s.name for s in failing(plant)]
+    entries = [plant.theta_entries.index(f"gain_{name}") for name in sensors]
+    count, kinds = len(sensors), 1 + len(GROWN)
+    of = np.array([plant.label_of(frozenset({sensor_mode(name)})) for name in sensors])
+    label = np.concatenate([labels, np.repeat(of, kinds)])
+    more, f = count * kinds, direction.shape[2]
+    wide_offset = np.zeros((len(label), offset.shape[1] + count))
+    wide_offset[: len(labels), : offset.shape[1]] = offset
+    wide = np.zeros((len(label), offset.shape[1] + count, f))
+    wide[: len(labels), : offset.shape[1]] = direction
+    m0, M0 = np.concatenate([b.m0, np.zeros((more, f))]), np.concatenate([b.M0, np.zeros((more, f, f))])
+    R, Q = np.tile(belief.R, (len(label), 1, 1)), np.concatenate([model.Q, np.tile(model.Q[:1], (more, 1, 1))])
+    heard = {plant.outputs[i].name: column for column, i in enumerate(belief.sensors)}
+    for i, name in enumerate(sensors):
+        first = len(labels) + kinds * i
+        wide[first, offset.shape[1] + i, 0], M0[first, 0, 0] = 1.0, GAIN[1] ** 2 / 3
+        if name in heard:
+            for j, factor in enumerate(GROWN):
+                R[first + 1 + j, heard[name], heard[name]] *= factor**2
+    inputs = model.inputs._replace(entries=np.concatenate([model.inputs.entries, entries]).astype(np.int64))
+    model = model.replace(inputs=inputs, Q=Q, H=None, lines=(wide_offset, wide))
+    shares = np.bincount(label)
+    return Rows(model, label, m0, M0, R, -np.log(shares[label]))
+
+
+class Bank(NamedTuple):
+    """State of the oracle; each episode carries its own truth."""
+
+    X: Array  # (n, r, N)
+    P: Array  # (n, r, N, N)
+    log: Array  # (n, r) log likelihood since the last change
+    changes: Array  # (n, K + 1) bool
+    acts: Array  # (n, K + 1) bool
+    now: Array  # (n,) bool: a fault acts
+    nu: Array  # (n, m) innovation of the healthy filter
+    S: Array  # (n, m, m) its covariance
+    checks: Checks | None
+
+
+@diagnoser(
+    "told_onset_bank",
+    "Extended Kalman filters, one per hypothesis, told when the label changes; for any plant",
+    knows="when the label changes",
+)
+def told_onset_bank(plant: Plant, belief: Belief, *, scenarios: Sequence[FaultScenario]) -> Diagnoser:
+    """The oracle.
+
+    Args:
+        plant: Any plant whose estimated quantity enters additively and whose sensors have noise.
+        belief: What it may assume of the plant.
+        scenarios: One per episode; when the label changes, and whether a fault acts, is all that is read of them.
+
+    Raises:
+        ValueError (from init): The number of episodes is not that of the scenarios.
+    """
+    r = rows(plant, belief)
+    model, z, x, count = r.model, r.model.z, r.model.x, len(r.label)
+    N, m, labels = len(model.scale), len(belief.R), len(plant.labels)
+    assert model.lines is not None
+    offset, direction = model.lines
+    own = offset.shape[1] if plant.bare is None else len(plant.estimated)
+    checks = None if plant.bare is None else SensorChecks(plant)
+
+    def start(n: int) -> Bank:
+        changes, acts = label_changes(plant, scenarios, n)
+        X, P = np.tile(model.X0, (n, count, 1)), np.tile(model.P0, (n, count, 1, 1))
+        return Bank(
+            X, P, np.zeros((n, count)), changes, acts, np.zeros(n, bool), np.zeros((n, m)), np.tile(belief.R, (n, 1, 1)),
+            None if checks is None else checks.start(n),
+        )  # fmt: skip
+
+    def predict(s: Bank, at: Interval) -> Bank:
+        n = len(at.k)
+        each, k = np.arange(n), np.minimum(at.k, s.acts.shape[1] - 1)
+        changed, now = s.changes[each, k], s.acts[each, k]
+        X, P, log = s.X.copy(), s.P.copy(), np.where(changed[:, None], 0.0, s.log)
+        X[changed], P[changed] = X[changed, :1], P[changed, :1]
+        X[..., z] = np.where(changed[:, None, None], r.m0, X[..., z])
+        P[changed, :, z, :] = 0.0
+        P[changed, :, :, z] = 0.0
+        P[..., z, z] = np.where(changed[:, None, None, None], r.M0, P[..., z, z])
+        X1, P1 = model.predict("extended", X.reshape(-1, N), P.reshape(-1, N, N), at)
+        return s._replace(X=X1.reshape(n, count, N), P=P1.reshape(n, count, N, N), log=log, now=now)
+
+    def update(s: Bank, at: Interval, y: Array, seen: Array) -> Bank:
+        n = len(s.now)
+        done = model.update("extended", s.X.reshape(-1, N), s.P.reshape(-1, N, N), at, y, seen, r.R)
+        found = s._replace(
+            X=done.X.reshape(n, count, N), P=done.P.reshape(n, count, N, N), nu=done.nu.reshape(n, count, m)[:, 0],
+            S=done.S.reshape(n, count, m, m)[:, 0], log=s.log + done.log_likelihood.reshape(n, count),
+        )  # fmt: skip
+        if checks is None or s.checks is None:
+            return found
+        return found._replace(checks=checks.update(s.checks, y, seen, Reading(nu=found.nu, S=found.S)))
+
+    def read(s: Bank) -> Reading:
+        n = len(s.now)
+        log = s.log + r.log_prior
+        by_label = np.full((n, labels), -np.inf)
+        for label in range(1, labels):
+            by_label[:, label] = logsumexp(log[:, r.label == label], axis=1)
+        if checks is not None and s.checks is not None:
+            gain = checks.repeated(s.checks)
+            by_label = np.where(gain > 0, np.maximum(by_label, s.log[:, :1] + 0.5 * gain), by_label)
+        by_label[~s.now] = -np.inf
+        by_label[~s.now, 0] = 0.0
+        probs = np.exp(by_label - logsumexp(by_label, axis=1, keepdims=True))
+        weight = np.exp(log - logsumexp(log[:, 1:], axis=1, keepdims=True)) * s.now[:, None]
+        weight[:, 0] = 0.0
+        deviation = offset + (direction @ s.X[..., z, None])[..., 0]
+        mean = (weight[..., None] * deviation).sum(axis=1)[:, :own]
+        return Reading(mean, x=s.X[:, 0, x], nu=s.nu, S=s.S, probs=probs)
+
+    rule = by_candidate(lambda reading, label: np.argmax(np.asarray(reading.probs), axis=1), 1)
+    return diagnoser_of(
+        plant, Filter(start, predict, update, read, expect=lambda s, at: model.expect(s.X[:, 0, x], at)), rule
+    )

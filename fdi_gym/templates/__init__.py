@@ -1,0 +1,1 @@
+"""What `fdi-gym new` writes: text files in which NAME, PACKAGE and ID are replaced."""
