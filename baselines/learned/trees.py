@@ -82,11 +82,11 @@ def flattened(trees: list[tuple[Array, Array, Array, Array, Array, int]], base: 
 
 def boosted(x: Array, label: Array, weight: Array, labels: int, seed: int) -> dict[str, Array]:
     """Gradient-boosted trees, one per label and round."""
-    from sklearn.ensemble import HistGradientBoostingClassifier  # pyright: ignore[reportMissingImports]
+    from sklearn.ensemble import HistGradientBoostingClassifier
 
     model = HistGradientBoostingClassifier(
         max_iter=ROUNDS, max_leaf_nodes=LEAVES, learning_rate=0.15, min_samples_leaf=FEWEST, l2_regularization=1.0,
-        early_stopping=False, random_state=seed,
+        early_stopping=False, random_state=seed,  # pyright: ignore[reportArgumentType]
     ).fit(x, label, sample_weight=weight)  # fmt: skip
     trees = []
     for stage in model._predictors:
@@ -103,7 +103,7 @@ def boosted(x: Array, label: Array, weight: Array, labels: int, seed: int) -> di
 
 def grown(x: Array, label: Array, weight: Array, labels: int, seed: int) -> dict[str, Array]:
     """A random forest."""
-    from sklearn.ensemble import RandomForestClassifier  # pyright: ignore[reportMissingImports]
+    from sklearn.ensemble import RandomForestClassifier
 
     model = RandomForestClassifier(n_estimators=FOREST, max_leaf_nodes=DEEP, min_samples_leaf=FEWEST, random_state=seed).fit(
         x.astype(np.float32), label, sample_weight=weight
