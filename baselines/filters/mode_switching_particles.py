@@ -31,6 +31,7 @@ from fdi_gym.estimation.interval import Interval
 from fdi_gym.plant import Array, Plant
 
 LEAST = 1e-12  # probability that a label is said to have at least
+FEWEST = 5  # samples between those at which a label may change
 
 
 class Particles(NamedTuple):
@@ -40,6 +41,8 @@ class Particles(NamedTuple):
     P: Array  # (n, M, N, N)
     label: Array  # (n, M) int
     w: Array  # (n, M) weights, sum 1
+    nu: Array  # (n, m) the last innovation of the particle that was heaviest after it, and
+    S: Array  # (n, m, m) its covariance
 
 
 def uniform(seed: int, k: Array) -> Array:
@@ -87,7 +90,7 @@ def particle_filter(b: Hypotheses, particles: int, branch: int, seed: int) -> Fi
         seed: Of the resampling.
     """
     model, labels, M = b.model, len(b.m0), particles
-    N, z, x, plant = len(model.scale), model.z, model.x, model.plant
+    N, m, z, x, plant = len(model.scale), len(model.R), model.z, model.x, model.plant
     assert model.lines is not None
     offset, direction = model.lines
     transition = np.linalg.matrix_power(b.transition, branch)
@@ -96,7 +99,8 @@ def particle_filter(b: Hypotheses, particles: int, branch: int, seed: int) -> Fi
     def start(n: int) -> Particles:
         X, P = np.tile(model.X0, (n, M, 1)), np.tile(model.P0, (n, M, 1, 1))
         X[..., z], P[..., z, z] = b.m0[0], b.M0[0]
-        return Particles(X, P, np.zeros((n, M), np.int64), np.tile(np.arange(M) == 0, (n, 1)).astype(float))
+        w = np.tile(np.arange(M) == 0, (n, 1)).astype(float)
+        return Particles(X, P, np.zeros((n, M), np.int64), w, np.zeros((n, m)), np.tile(model.R, (n, 1, 1)))
 
     def continued(s: Particles) -> Particles:
         """Each particle with every label, the label changing fastest: (n, M labels, ...)."""
@@ -109,14 +113,14 @@ def particle_filter(b: Hypotheses, particles: int, branch: int, seed: int) -> Fi
         P[..., z, :] = np.where(cut, 0.0, P[..., z, :])
         P[..., z] = np.where(cut, 0.0, P[..., z])
         P[..., z, z] = np.where(cut, b.M0[label], P[..., z, z])
-        return Particles(X, P, label, w)
+        return s._replace(X=X, P=P, label=label, w=w)
 
     def moved(own: AugmentedModel, X: Array, P: Array, at: Interval, y: Array, seen: Array, go: bool) -> Any:
-        """Rows one sample later, updated with it: X, P, log likelihood."""
+        """Rows one sample later, updated with it: X, P, log likelihood, innovation and its covariance."""
         if go:
             X, P = own.predict("extended", X, P, at)
         done = own.update("extended", X, P, at, y, seen)
-        return done.X, done.P, done.log_likelihood
+        return done.X, done.P, done.log_likelihood, done.nu, done.S
 
     def followed(s: Particles, at: Interval, y: Array, seen: Array, go: bool, in_turn: bool) -> Particles:
         """All particles after the sample; `in_turn`: their labels are 0, 1, ... in turn."""
@@ -124,22 +128,24 @@ def particle_filter(b: Hypotheses, particles: int, branch: int, seed: int) -> Fi
         X, P, which = s.X.reshape(-1, N), s.P.reshape(-1, N, N), s.label.ravel()
         many, home = at.of(np.repeat(np.arange(n), C)), np.repeat(np.arange(n), C)
         if in_turn:
-            X, P, log = moved(model, X, P, many, y[home], seen[home], go)
+            X, P, log, nu, S = moved(model, X, P, many, y[home], seen[home], go)
         else:
-            X, P, log = X.copy(), P.copy(), np.zeros(len(X))
+            X, P, log, nu, S = X.copy(), P.copy(), np.zeros(len(X)), np.zeros((len(X), m)), np.zeros((len(X), m, m))
             for j in np.unique(which):
                 mine = np.flatnonzero((which == j) & (s.w.ravel() > 0))
                 if mine.size:
                     at_j = home[mine]
-                    X[mine], P[mine], log[mine] = moved(alone[j], X[mine], P[mine], at.of(at_j), y[at_j], seen[at_j], go)
+                    found = moved(alone[j], X[mine], P[mine], at.of(at_j), y[at_j], seen[at_j], go)
+                    X[mine], P[mine], log[mine], nu[mine], S[mine] = found
         log = np.where(s.w > 0, log.reshape(n, C), -np.inf)
         w = s.w * np.exp(log - log.max(axis=1, keepdims=True))
         w = w / w.sum(axis=1, keepdims=True)
-        return Particles(X.reshape(n, C, N), P.reshape(n, C, N, N), s.label, w)
+        first = np.arange(n) * C + np.argmax(w, axis=1)
+        return Particles(X.reshape(n, C, N), P.reshape(n, C, N, N), s.label, w, nu[first], S[first])
 
     def update(s: Particles, at: Interval, y: Array, seen: Array) -> Particles:
         first, turn = at.k == 0, (at.k > 0) & ((at.k - 1) % branch == 0)
-        X, P, label, w = (a.copy() for a in s)
+        after = Particles(*(a.copy() for a in s))
         for group, go, branching in ((first, False, False), (turn, True, True), (~first & ~turn, True, False)):
             i = np.flatnonzero(group)
             if not i.size:
@@ -149,9 +155,10 @@ def particle_filter(b: Hypotheses, particles: int, branch: int, seed: int) -> Fi
             if branching:
                 stay, weight = thinned(part.w, M, uniform(seed, at.k[i]))
                 rows = np.arange(len(i))[:, None]
-                part = Particles(part.X[rows, stay], part.P[rows, stay], part.label[rows, stay], weight)
-            X[i], P[i], label[i], w[i] = part
-        return Particles(X, P, label, w)
+                part = part._replace(X=part.X[rows, stay], P=part.P[rows, stay], label=part.label[rows, stay], w=weight)
+            for whole, found in zip(after, part, strict=True):
+                whole[i] = found
+        return after
 
     def read(s: Particles) -> Reading:
         n = len(s.w)
@@ -164,7 +171,8 @@ def particle_filter(b: Hypotheses, particles: int, branch: int, seed: int) -> Fi
         within = D @ s.P[..., z, z] @ np.swapaxes(D, -1, -2)
         spread = (weight[..., None] * (within + gap[..., :, None] * gap[..., None, :])).sum(axis=1)
         shown = {"effective particles": 1.0 / (s.w**2).sum(axis=1)}
-        return Reading(mean, spread, state, cost=-2.0 * np.log(np.maximum(probs, LEAST)), probs=probs, signals=shown)
+        cost = -2.0 * np.log(np.maximum(probs, LEAST))
+        return Reading(mean, spread, state, nu=s.nu, S=s.S, cost=cost, probs=probs, signals=shown)
 
     def expect(s: Particles, at: Interval) -> Array:
         state = (s.w[..., None] * s.X[..., x]).sum(axis=1)
@@ -185,7 +193,7 @@ def mode_switching_particles(
         belief: The magnitudes of its faults, how often labels change, model errors.
         calibration: When it alarms.
         particles: Label histories that are kept.
-        branch_s: Seconds between the samples at which a label may change; a sample's length at least.
+        branch_s: Seconds between the samples at which a label may change; FEWEST samples at least.
         seed: Of the resampling.
 
     Raises:
@@ -195,6 +203,6 @@ def mode_switching_particles(
         raise ValueError(
             f"particles are 1 or more, branch_s above 0, the seed 0 or more, not {particles}, {branch_s}, {seed}"
         )
-    branch = max(1, round(branch_s / plant.dt))
+    branch = max(FEWEST, round(branch_s / plant.dt))
     filter = particle_filter(hypotheses(plant, belief), particles, branch, seed)
     return diagnoser_of(plant, filter, by_labels(plant, calibration))

@@ -55,6 +55,8 @@ class Bank(NamedTuple):
     P: Array  # (n, b, N, N)
     T: Array  # (n, 1 + groups, paces)
     worst: Array  # (n, m) normalised residuals of the last sample: of each sensor, in an observer that does not hear it
+    nu: Array  # (n, m) the last innovation of that which hears everything, and
+    S: Array  # (n, m, m) its covariance
 
 
 def grouped(plant: Plant, model: AugmentedModel, size: Array, groups: Sequence[Sequence[str]] | None) -> Groups:
@@ -164,8 +166,9 @@ def bank_filter(plant: Plant, model: AugmentedModel, groups: Groups, dedicated: 
 
     def start(n: int) -> Bank:
         return Bank(
-            np.tile(model.X0, (n, b, 1)), np.tile(model.P0, (n, b, 1, 1)), np.zeros((n, b, len(keep))), np.zeros((n, m))
-        )
+            np.tile(model.X0, (n, b, 1)), np.tile(model.P0, (n, b, 1, 1)), np.zeros((n, b, len(keep))), np.zeros((n, m)),
+            np.zeros((n, m)), np.tile(model.R, (n, 1, 1)),
+        )  # fmt: skip
 
     def predict(s: Bank, at: Interval) -> Bank:
         n = len(s.X)
@@ -196,7 +199,10 @@ def bank_filter(plant: Plant, model: AugmentedModel, groups: Groups, dedicated: 
             "extended", X, P, at.of(np.repeat(np.arange(n), b)), np.repeat(y, b, axis=0), which.reshape(n * b, -1)
         )
         sums = np.where(new[:, None, None], keep * s.T + told[..., None], s.T)
-        return Bank(done.X.reshape(n, b, N), done.P.reshape(n, b, N, N), sums, np.where(new[:, None], worst, s.worst))
+        first = (a.reshape(n, b, *a.shape[1:])[:, 0] for a in (done.nu, done.S))
+        return Bank(
+            done.X.reshape(n, b, N), done.P.reshape(n, b, N, N), sums, np.where(new[:, None], worst, s.worst), *first
+        )  # fmt: skip
 
     def read(s: Bank) -> Reading:
         gain = (s.T[:, :1] - s.T[:, 1:]).max(axis=2)  # (n, groups)
@@ -207,7 +213,7 @@ def bank_filter(plant: Plant, model: AugmentedModel, groups: Groups, dedicated: 
         cost[:, sensors] = -gain[:, groups.of_label[sensors]]
         x = model.x
         signals = {"evidence": gain, "residuals unheard": s.worst}
-        return Reading(x=s.X[:, 0, x], Px=s.P[:, 0, x, x], cost=cost, signals=signals)
+        return Reading(x=s.X[:, 0, x], Px=s.P[:, 0, x, x], nu=s.nu, S=s.S, cost=cost, signals=signals)
 
     return Filter(start, predict, update, read, expect=lambda s, at: model.expect(s.X[:, 0, model.x], at))
 

@@ -74,7 +74,8 @@ class Generator(NamedTuple):
     Y: Array  # (n, N, N)
     M: Array  # (n, N, p)
     faults: Array  # (n,) bool: an interval has ended in which a fault could have acted
-    size: Array  # (n,) mean square of the last residual
+    nu: Array  # (n, m) the last innovation, and
+    S: Array  # (n, m, m) its covariance
     sums: Sums
 
 
@@ -88,13 +89,13 @@ def residual_filter(plant: Plant, belief: Belief, paces: Sequence[float]) -> Fil
     """
     model, bare = augmented(plant, belief), augmented(plant, belief, faults=False)
     s0, about = steady(plant, bare), local(model, belief.z_size)
-    keep, p, N = 1.0 - 1.0 / np.asarray(paces, float), len(belief.z_size), len(bare.scale)
+    keep, p, N, m = 1.0 - 1.0 / np.asarray(paces, float), len(belief.z_size), len(bare.scale), len(bare.R)
     sets, labels, x = manifolds(plant), len(plant.labels), bare.x
 
     def start(n: int) -> Generator:
         return Generator(
-            np.tile(bare.X0, (n, 1)), np.tile(s0.Y, (n, 1, 1)), np.zeros((n, N, p)), np.zeros(n, bool), np.zeros(n),
-            nothing_said(n, len(keep), p),
+            np.tile(bare.X0, (n, 1)), np.tile(s0.Y, (n, 1, 1)), np.zeros((n, N, p)), np.zeros(n, bool), np.zeros((n, m)),
+            np.tile(s0.R, (n, 1, 1)), nothing_said(n, len(keep), p),
         )  # fmt: skip
 
     def predict(s: Generator, at: Interval) -> Generator:
@@ -111,14 +112,14 @@ def residual_filter(plant: Plant, belief: Belief, paces: Sequence[float]) -> Fil
         weighed = solve(S, T(Vt))
         new = there.any(axis=1)
         sums = heard(s.sums, keep, Vt @ weighed, times(T(weighed), nu), new & s.faults)
-        size = quadratic(nu, S) / np.maximum(there.sum(axis=1), 1)
         return Generator(
-            s.X + times(K, nu), symmetric(s.Y - K @ T(cross)), s.M - K @ T(Vt), s.faults, np.where(new, size, s.size), sums
-        )
+            s.X + times(K, nu), symmetric(s.Y - K @ T(cross)), s.M - K @ T(Vt), s.faults, nu, S, sums
+        )  # fmt: skip
 
     def read(s: Generator) -> Reading:
         cost, z = spoken_for(s.sums.G, s.sums.g, sets, labels)
-        return Reading(z, x=s.X[:, x], Px=s.Y[:, x, x], cost=cost, signals={"residual": s.size})
+        shown = {"residual": quadratic(s.nu, s.S) / m}
+        return Reading(z, x=s.X[:, x], Px=s.Y[:, x, x], nu=s.nu, S=s.S, cost=cost, signals=shown)
 
     return Filter(start, predict, update, read, expect=lambda s, at: bare.expect(s.X[:, x], at))
 

@@ -126,7 +126,7 @@ def parity_filter(plant: Plant, belief: Belief, order: int, paces: Sequence[floa
     def read(w: Window) -> Reading:
         healthy = reading_of(bare, w.healthy)
         cost, z = spoken_for(w.sums.G, w.sums.g, sets, labels)
-        return Reading(z, x=healthy.x, Px=healthy.Px, cost=cost, signals={"parity residual": w.size})
+        return healthy._replace(z=z, P=None, cost=cost, signals={"parity residual": w.size})
 
     filter = Filter(start, predict, update, read, expect=lambda w, at: model.expect(w.healthy.X[:, model.x], at))
     if not (np.diagonal(_seen(plant, filter, order), axis1=1, axis2=2) * belief.z_size**2 > LEAST**2).any():

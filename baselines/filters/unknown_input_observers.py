@@ -54,6 +54,8 @@ class Bank(NamedTuple):
     energy: Array  # (n, b, paces) of the residuals that the disturbances leave, in excess of what noise makes
     r: Array  # (n, b) nu' S^-1 nu of the last residual: all inputs of the observer cancelled
     freedoms: Array  # (n, b) and its degrees of freedom
+    nu: Array  # (n, m) the last innovation of the first observer, and
+    S: Array  # (n, m, m) its covariance, if disturbances have their typical sizes
 
 
 class Cancelled(NamedTuple):
@@ -154,7 +156,10 @@ def bank_filter(plant: Plant, model: AugmentedModel, size: Array, observers: Obs
 
         k = len(keep)
         X, P = np.tile(plant.trim_state, (n, b, 1)), np.tile(model.P0[x, x], (n, b, 1, 1))
-        return Bank(X, P, zeros(n_x, p + q), zeros(b, k, p, p), zeros(b, k, p), zeros(b, k), zeros(b), zeros(b))
+        return Bank(
+            X, P, zeros(n_x, p + q), zeros(b, k, p, p), zeros(b, k, p), zeros(b, k), zeros(b), zeros(b), zeros(m),
+            np.tile(model.R, (n, 1, 1)),
+        )  # fmt: skip
 
     def around(s: Bank) -> Array:
         """Where the model is linearised: the estimate of the observer whose residuals are smallest (n, n_x + q)."""
@@ -210,6 +215,7 @@ def bank_filter(plant: Plant, model: AugmentedModel, size: Array, observers: Obs
             np.where(heard[..., None], keep[:, None] * s.g + Iz.reshape(n, b, 1, p), s.g),
             np.where(heard, keep * s.energy + excess.reshape(n, b, 1), s.energy),
             (total - inputs_of.gain).reshape(n, b), (there.sum(axis=1) - inputs_of.freedoms).reshape(n, b),
+            nu.reshape(n, b, m)[:, 0], (S + T(Ft) @ Ft).reshape(n, b, m, m)[:, 0],
         )  # fmt: skip
 
     def read(s: Bank) -> Reading:
@@ -228,7 +234,7 @@ def bank_filter(plant: Plant, model: AugmentedModel, size: Array, observers: Obs
         best = np.argmin(cost, axis=1)
         own = np.argmin(cost[:, observers.labels], axis=1)
         shown = {"residuals": s.r, "degrees of freedom": s.freedoms}
-        return Reading(z[np.arange(n), best], x=s.X[np.arange(n), own], cost=cost, signals=shown)
+        return Reading(z[np.arange(n), best], x=s.X[np.arange(n), own], nu=s.nu, S=s.S, cost=cost, signals=shown)
 
     return Filter(start, predict, update, read, expect=lambda s, at: model.expect(around(s)[:, :n_x], at))
 
