@@ -4,13 +4,21 @@ import itertools
 
 import numpy as np
 import pytest
-from conftest import states
+from conftest import build, states
 from test_general_filters import belief_of
 
 from baselines.filters import multiple_model
-from baselines.filters.mode_switching_particles import particle_filter, thinned, threshold, uniform
-from fdi_gym.diagnosis import make_diagnoser, run
+from baselines.filters.mode_switching_particles import (
+    mode_switching_particles,
+    particle_filter,
+    thinned,
+    threshold,
+    uniform,
+)
+from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, make_diagnoser, run
 from fdi_gym.diagnosis.fitting import flights_of
+from fdi_gym.diagnosis.knowledge import knowledge_of
+from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.linear import linear_model
 
 BRANCH, STEPS = 10, 31  # branches at samples 1, 11, 21: 125 histories of 5 labels
@@ -113,6 +121,12 @@ def test_thinning_keeps_the_heavy_and_is_unbiased():
     assert weight[0].tolist() == [0.7, 0.3, 0.0, 0.0]
 
 
+def particles_of(plant, **settings):
+    """With the shipped belief, never alarming."""
+    belief = knowledge_of(find_diagnoser("multiple_model_ekf"), plant, "standard", {})["belief"]
+    return mode_switching_particles(plant, belief, Calibration(), **settings)
+
+
 def test_random_numbers_are_functions_of_seed_and_sample():
     a = uniform(0, np.array([3, 7, 3]))
     assert a[0] == a[2] == uniform(0, np.array([3]))[0] != a[1]
@@ -122,9 +136,20 @@ def test_random_numbers_are_functions_of_seed_and_sample():
 
 def test_the_same_bytes_alone_and_in_company_and_another_seed_differs(b747):
     obs = flights_of(b747, "standard", 400_000, 3, True)[1].obs[:, :150]
-    said = run(make_diagnoser("mode_switching_particles", b747, particles=3), obs)
-    alone = run(make_diagnoser("mode_switching_particles", b747, particles=3), obs[1:2])
-    assert np.array_equal(said.label_probs[1], alone.label_probs[0])
+
+    def probs(seed, obs):
+        return run(particles_of(b747, particles=3, seed=seed), obs).label_probs
+
+    said = probs(0, obs)
+    assert np.array_equal(said[1], probs(0, obs[1:2])[0])
+    assert not np.array_equal(said, probs(1, obs))
+
+
+def test_too_much_work_is_declined_and_less_is_not():
+    satellite = build("CMGSatellite")
+    with pytest.raises(NotApplicableError, match="cost too much.*fewer particles run"):
+        particles_of(satellite)
+    particles_of(satellite, particles=8)
 
 
 @pytest.mark.parametrize("settings", [{"particles": 0}, {"branch_s": 0}, {"branch_s": float("nan")}, {"seed": -1}])

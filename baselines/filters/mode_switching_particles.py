@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from baselines.filters.multiple_model import Hypotheses, hypotheses
-from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
+from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser, diagnoser_of
 from fdi_gym.estimation.augmented import AugmentedModel
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
@@ -32,6 +32,7 @@ from fdi_gym.plant import Array, Plant
 
 LEAST = 1e-12  # probability that a label is said to have at least
 FEWEST = 5  # samples between those at which a label may change
+MOST = 8e6  # products of a covariance's update, N^3, in a second of flight: beyond, suites take hours
 
 
 class Particles(NamedTuple):
@@ -197,6 +198,7 @@ def mode_switching_particles(
         seed: Of the resampling.
 
     Raises:
+        NotApplicableError: That would cost too much.
         ValueError: A number out of range.
     """
     if particles < 1 or not 0 < branch_s < np.inf or seed < 0:
@@ -204,5 +206,12 @@ def mode_switching_particles(
             f"particles are 1 or more, branch_s above 0, the seed 0 or more, not {particles}, {branch_s}, {seed}"
         )
     branch = max(FEWEST, round(branch_s / plant.dt))
-    filter = particle_filter(hypotheses(plant, belief), particles, branch, seed)
-    return diagnoser_of(plant, filter, by_labels(plant, calibration))
+    b = hypotheses(plant, belief)
+    N, labels, rate = len(b.model.scale), len(plant.labels), 1.0 / plant.dt
+    work = particles * N**3 * rate * (1 + labels / branch)
+    if work > MOST:
+        raise NotApplicableError(
+            f"{particles} particles of {N} entries, {rate:g} samples a second and {labels} labels cost too much: {work:.1e} "
+            f"products a second of flight, where {MOST:.0e} are allowed; fewer particles run"
+        )
+    return diagnoser_of(plant, particle_filter(b, particles, branch, seed), by_labels(plant, calibration))
