@@ -147,7 +147,7 @@ def test_the_same_bytes_alone_and_in_company_and_another_seed_differs(b747):
 
 def test_too_much_work_is_declined_and_less_is_not():
     satellite = build("CMGSatellite")
-    with pytest.raises(NotApplicableError, match="cost too much.*fewer particles run"):
+    with pytest.raises(NotApplicableError, match=r"cost too much.*fewer particles run"):
         particles_of(satellite)
     particles_of(satellite, particles=8)
 
