@@ -80,6 +80,14 @@ def test_a_sensor_fault_of_the_plant_is_named_and_others_are_not():
     assert (said.label[(last == 1) | (last == 2), -1] == 0).mean() > 0.7
 
 
+def test_where_no_label_is_a_sensors_there_is_nothing_to_name(b747):
+    with pytest.raises(
+        NotApplicableError, match=r"no label of B747Lateral is a sensor's fault; with the option sensor_faults"
+    ):
+        make_diagnoser("generalised_observers", b747)
+    make_diagnoser("generalised_observers", build("B747Lateral", sensor_faults=True), process="mixed")
+
+
 def test_dedicated_sums_leave_out_all_pairs_of_the_group():
     """Written out as loops."""
     rng, m = np.random.default_rng(0), 4

@@ -244,7 +244,8 @@ def generalised_observers(
     """The scheme with its decision.
 
     Args:
-        plant: Any plant whose estimated quantity enters additively and which has two sensors with noise or more.
+        plant: Any plant whose estimated quantity enters additively, with two sensors with noise or more, and labels
+            that are faults of theirs.
         belief: What it may assume of the plant.
         calibration: When it alarms.
         scheme: "generalised" or "dedicated".
@@ -252,7 +253,7 @@ def generalised_observers(
         paces: Samples within which each of the sums of evidence forgets, 1 or more.
 
     Raises:
-        NotApplicableError: Too few sensors, or none can be left out.
+        NotApplicableError: No label is a sensor's fault, too few sensors, or none can be left out.
         ValueError: Unknown scheme or sensor, or a number out of range.
     """
     if scheme not in ("generalised", "dedicated"):
@@ -260,6 +261,8 @@ def generalised_observers(
     if not paces or min(paces) < 1:
         raise ValueError(f"paces of at least 1 sample are allowed, not {tuple(paces)}")
     found = grouped(plant, augmented(plant, belief), belief.z_size, groups)
+    if (found.of_label < 0).all():
+        raise NotApplicableError(f"no label of {plant.id} is a sensor's fault; with the option sensor_faults there are")
     bare = augmented(plant, belief, faults=False)
     filter = bank_filter(plant, bare, found, scheme == "dedicated", paces)
     return diagnoser_of(plant, filter, only_sensors(by_labels(plant, calibration), found.of_label))
