@@ -77,7 +77,7 @@ def test_shares_are_those_of_the_convolutions():
         kernel = np.zeros(8 * DILATIONS[d] + 1)
         kernel[:: DILATIONS[d]] = np.where(np.isin(np.arange(9), TRIPLES[k]), 2.0, -1.0)
         for i in range(3):
-            together = x[i][:, rocket["channels"][pair] > 0].sum(axis=1)
+            together = x[i][rocket["channels"][pair] > 0].sum(axis=0)
             value = np.convolve(together, kernel[::-1])[4 * DILATIONS[d] :][:64]
             edge = 4 * DILATIONS[d] if (d + k) % 2 else 0
             value = value[edge : 64 - edge]

@@ -37,8 +37,8 @@ HELD_OUT = 0.2  # share of the examples that choose
 
 
 def saturated(windows: Array) -> Array:
-    """Windows as the kernels see them."""
-    return contiguous(KNEE * np.tanh(np.asarray(windows, float) / KNEE))
+    """Windows (n, L, n_obs) as the kernels see them: (n, n_obs, L)."""
+    return contiguous(KNEE * np.tanh(np.swapaxes(np.asarray(windows, float), 1, 2) / KNEE))
 
 
 def featurise(rocket: Mapping[str, Array], windows: Array) -> Array:
@@ -63,7 +63,7 @@ def drawn(windows: Array, rng: np.random.Generator) -> dict[str, Array]:
         size = int(2 ** rng.uniform(0.0, np.log2(min(many, WEIGHTS) + 1)))
         row[rng.choice(many, size, replace=False)] = True
     some = saturated(windows[rng.choice(len(windows), min(SAMPLES, len(windows)), replace=False)])
-    found = np.empty((len(some), PAIRS, some.shape[1]))
+    found = np.empty((len(some), PAIRS, some.shape[2]))
     values(some, DILATIONS, TRIPLES, channels, found)
     golden = (np.arange(1, PAIRS * BIASES + 1) * (np.sqrt(5.0) + 1) / 2 % 1.0).reshape(PAIRS, BIASES)
     which = rng.integers(len(some), size=PAIRS)
