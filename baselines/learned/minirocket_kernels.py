@@ -17,7 +17,7 @@ WEIGHTS = 9
 
 @helper
 def convolved(x, dilation, triple, channels, total, out):
-    """out[t] = the kernel's convolution of total, the sum of the chosen channels of x (channels, L), zeros beyond its ends."""
+    """out[t] = the kernel's convolution of total, the sum of the chosen channels of x (channels, L), 0 beyond its ends."""
     many, L = x.shape
     for t in range(L):
         total[t] = 0.0
