@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from conftest import states
+from conftest import build, states
 from test_general_filters import belief_of
 from test_parity_space import commands, flown
 
-from baselines.filters.unknown_input_observers import bank_filter, existing
+from baselines.filters.unknown_input_observers import _missing, bank_filter, existing
 from fdi_gym.diagnosis import NotApplicableError, make_diagnoser
 from fdi_gym.estimation.augmented import augmented
 
@@ -117,13 +117,16 @@ def test_existence_conditions(b747, motor):
     with pytest.raises(NotApplicableError, match="leave no residual of 2 sensors"):
         make_diagnoser("unknown_input_observers", motor)
     assert set(existing(b747, augmented(b747, belief_of(b747)), belief_of(b747).z_size).labels) == set(range(5))
-    from baselines.filters.unknown_input_observers import _missing
-
     A, C = np.diag([0.5, 0.5, 1.2]), np.eye(3)[:2]
     assert "rank" in _missing(A, np.eye(3)[:, 2:], C, np.zeros((2, 1)))
     assert "hidden" in _missing(A, np.eye(3)[:, :1], C, np.zeros((2, 1)))
     assert _missing(np.diag([0.5, 0.5, 0.9]), np.eye(3)[:, :1], C, np.zeros((2, 1))) == ""
     assert "leave no residual" in _missing(A, np.eye(3)[:, :2], C, np.zeros((2, 2)))
+
+
+def test_a_bank_that_costs_too_much_is_declined():
+    with pytest.raises(NotApplicableError, match="16 observers of 11 states at 100 samples a second cost too much"):
+        make_diagnoser("unknown_input_observers", build("CMGSatellite"))
 
 
 def test_gaps_leave_an_unknown_input_uncertain(b747):

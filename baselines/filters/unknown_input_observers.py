@@ -40,6 +40,7 @@ from fdi_gym.plant import Array, Plant
 
 RANK = 1e-6  # of F against [E; H], both in typical sizes: below, the sensors do not show an input at once
 NEVER = 1e12  # the cost of a label without an observer
+MOST = 1e6  # products of the covariances' updates, n_x^3 each, in a second of flight
 WIDE = 1e-8  # information in the prior of an unknown input: its spread is ten thousand typical sizes
 
 
@@ -252,11 +253,19 @@ def unknown_input_observers(
         paces: Samples within which each of the sums of evidence forgets, 1 or more.
 
     Raises:
-        NotApplicableError: No observer exists: a rank condition, or an unstable mode that nothing shows.
+        NotApplicableError: No observer exists: a rank condition, or an unstable mode that nothing shows; or so many
+            that they cost too much.
         ValueError: A number out of range.
     """
     if not paces or min(paces) < 1:
         raise ValueError(f"paces of at least 1 sample are allowed, not {tuple(paces)}")
     model = augmented(plant, belief)
     observers = existing(plant, model, belief.z_size)
+    many, n_x, rate = len(observers.labels), len(plant.states), 1.0 / plant.dt
+    work = many * n_x**3 * rate
+    if work > MOST:
+        raise NotApplicableError(
+            f"{many} observers of {n_x} states at {rate:g} samples a second cost too much: {work:.1e} products a second of "
+            f"flight, where {MOST:.0e} are allowed"
+        )
     return diagnoser_of(plant, bank_filter(plant, model, belief.z_size, observers, paces), by_labels(plant, calibration))
