@@ -4,8 +4,8 @@
     python benchmarks/suites.py --draw     draws all of them again, which gives the files that are there
 
 Satellite flights are long: the windows of three standard flights follow one another in one, five times as fast, and the hard
-flights are cut after 50 s. The papers' scenarios are flown as they are, at 30 noise seeds; they hold only the labels that the
-paper has.
+flights are cut after 50 s. The papers' scenarios are flown as they are, at 30 noise seeds; they hold only the labels that
+the paper has.
 """
 
 import argparse

@@ -12,12 +12,16 @@ __version__ = "0.1.0"
 
 
 def _register_environment(plant_id: str, version: int) -> None:
-    gym.register(
-        id=f"{plant_id}-Faults-v{version}",
-        entry_point="fdi_gym.envs:FDIEnv",
-        vector_entry_point="fdi_gym.vector_envs:FDIVectorEnv",
-        kwargs={"plant": plant_id},
-    )
+    for kind, single, vector in (
+        ("Faults", "envs:FDIEnv", "vector_envs:FDIVectorEnv"),
+        ("Active", "active_envs:ActiveEnv", "active_envs:ActiveVectorEnv"),
+    ):
+        gym.register(
+            id=f"{plant_id}-{kind}-v{version}",
+            entry_point=f"fdi_gym.{single}",
+            vector_entry_point=f"fdi_gym.{vector}",
+            kwargs={"plant": plant_id},
+        )
 
 
 def register_plant(plant_id: str, builder: str, version: int = 0) -> str:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fdi_gym import shapes
+from fdi_gym.acting import Acting, wrong_acting
 from fdi_gym.data_sheet import Kernels
 from fdi_gym.faults import (
     Abrupt,
@@ -120,6 +121,10 @@ def _wrong(plant: Plant) -> Iterable[str]:
     reward, n = np.asarray(plant.isolation_reward), len(plant.labels)
     if reward.shape != (n, n) or reward.dtype.kind not in "iufb" or not np.isfinite(reward).all():
         yield f"isolation_reward holds finite numbers in the shape ({n}, {n}), not {plant.isolation_reward!r}"
+    if plant.acting is not None and not isinstance(plant.acting, Acting):
+        yield f"acting is an Acting, not {plant.acting!r}"
+    elif plant.acting is not None and plant.bare is None and not plant.simultaneous:
+        yield from wrong_acting(plant, plant.acting)
 
 
 def twice(what: str, names: Sequence[Any]) -> Iterable[str]:

@@ -158,25 +158,26 @@ _I, _D3 = int64[::1], float64[:, :, ::1]
 @compiled(
     void(
         int64, int64, int64, int64, int64, int64,
-        float64, int64, int64, V, V, M, M, V, float64, _I,
-        uint64[::1], _I, _I, _I, _I, _I, _I, _I, M, _D3, _I, int64[:, ::1], int64[:, :, ::1],
+        float64, int64, int64, V, M, M, V, float64, _I,
+        uint64[::1], _I, _I, _I, _I, _I, _I, _I, M, M, _D3, _I, int64[:, ::1], int64[:, :, ::1],
         _D3, _I, _I, M, M, M, M, M, _D3, _D3, M,
-        _I, int64, int64, _D3, float64[:, :, :, ::1], _D3, _D3, _D3, int64[:, ::1],
+        _I, int64, int64, _D3, _D3, float64[:, :, :, ::1], _D3, _D3, _D3, int64[:, ::1],
     )
 )  # fmt: skip
 def fly(
     dynamics_address, output_address, control_address, known_address, project_address, outside_address,
-    dt, substeps, true_feedback, nominal, q, sensor_box, command_box, sigma, limit, widths,
+    dt, substeps, true_feedback, nominal, sensor_box, command_box, sigma, limit, widths,
     seed, steps, reference_at, disturbance_at, process_noise, sensor_noise, reference_step, disturbance_step,
-    p, effects, counts, values, labels,
+    p, parameters, effects, counts, values, labels,
     reporting, at, status, X, C, U, THETA, held, readings, histories, dropped,
-    slots, first, samples, inputs, sensors, obs, state, theta, label,
+    slots, first, samples, inputs, references_added, sensors, obs, state, theta, label,
 ):  # fmt: skip
     """Fly the flights in `slots` on by so many samples, into the rows from `first` on of obs, state, theta and label.
 
     The second line of arguments is the plant's, the next two the flights' (one row each; tables by address, with a step of
     0 where one row serves all samples; a noise address of 0: by counter), then how their sensors report (nothing: at every
     sample) and where they are, changed in place. `inputs` (samples, flights, n_u) is added to the command within its range,
+    `references_added` (samples, flights, n_r) to what it follows,
     `sensors` (samples, flights, n_y, FAULTS) is what is wrong with the sensors; either may be empty. Of theta the plant's
     equations get the first `widths[2]` entries; where there are more, they are the faults of its sensors, column by column.
     """
@@ -217,7 +218,7 @@ def fly(
             disturbances = _at(_pointer(disturbance_at[slot]), (last + 1, n_d), float64)
             w = _at(_pointer(process_noise[slot]), (last, n), float64)
             v = _at(_pointer(sensor_noise[slot]), (last + 1, n_y), float64)
-            acting, count, values_i, held_i = effects[slot], counts[slot], values[slot], held[slot]
+            q, acting, count, values_i, held_i = parameters[slot], effects[slot], counts[slot], values[slot], held[slot]
             readings_i, history, segment = readings[slot], histories[slot], 0
             again = reports and reporting[slot, 0, AGAIN] != 0.0
             faulty = tabled or reports or (layered and count > 0)
@@ -230,6 +231,9 @@ def fly(
                 # sample k: what acts, what is measured, what is known
                 for i in range(n_r):
                     r[i] = references[k * step_r, i]
+                if references_added.shape[0]:
+                    for i in range(n_r):
+                        r[i] += references_added[s, slot, i]
                 for i in range(n_d):
                     d[i] = disturbances[min(k, last - 1) * step_d, i]
                 if count:

@@ -45,6 +45,13 @@ class Record(NamedTuple):
     terminated: Array  # (N,) bool, ended before its scenario's last step
 
 
+class Added(NamedTuple):
+    """What an agent adds to N flights in m samples, as `advance` takes it."""
+
+    inputs: Array | None = None  # (m, N, n_u)
+    references: Array | None = None  # (m, N, n_r)
+
+
 def white_noise(plant: Plant, rng: np.random.Generator, steps: int) -> tuple[Array, Array]:
     """Process noise w (steps, n_x) and sensor noise v (steps + 1, n_y) from a generator, to be injected."""
     v = rng.standard_normal((steps + 1, len(plant.outputs)))
@@ -66,6 +73,7 @@ def advance(
     first: int = 0,
     slots: Array | None = None,
     inputs: Array | None = None,
+    references: Array | None = None,
     sensors: Array | None = None,
     threads: int | None = None,
 ) -> Chunk:
@@ -78,6 +86,7 @@ def advance(
         first: That row.
         slots: (n,) int64, the flights that are flown. Default: all.
         inputs: (samples, N, n_u) added to the command, within its range. Default: none.
+        references: (samples, N, n_r) added to the reference rows, for all who read them. Default: none.
         sensors: (samples, N, n_y, 6) what is wrong with each sensor: relative error of its gain, bias, relative increase
             of its noise, 1 where it is frozen at its last reading, samples by which it lags, 1 where it does not report (it
             reads NaN, and the controller goes on with the last reading). Default: nothing, as is a table of zeros.
@@ -91,6 +100,7 @@ def advance(
     chunk = flights.blank(first + samples) if into is None else into
     slots = np.arange(n) if slots is None else slots
     inputs = _optional("inputs", inputs, (samples, n, n_u))
+    references = _optional("references", references, (samples, n, plant.reference_width))
     sensors = _optional("sensors", sensors, (samples, n, n_y, FAULTS))
     lags = sensors[..., closed_loop.LAG]
     if lags.size and (lags.min() < 0 or lags.max() > max(flights.history.shape[1] - 1, 0)):
@@ -98,12 +108,12 @@ def advance(
             f"a sensor lags by 0 to {max(flights.history.shape[1] - 1, 0)} samples (longest_lag of the flights)"
         )
     arguments = (
-        *plant.addresses, plant.dt, plant.substeps, int(plant.true_feedback), plant.nominal_theta, contiguous(plant.q),
+        *plant.addresses, plant.dt, plant.substeps, int(plant.true_feedback), plant.nominal_theta,
         *flights.signals, *flights.arrays(),
     )  # fmt: skip
 
     def fly(block: Array) -> None:
-        closed_loop.fly(*arguments, block, first, samples, inputs, sensors, *chunk)
+        closed_loop.fly(*arguments, block, first, samples, inputs, references, sensors, *chunk)
 
     most = numba.config.NUMBA_NUM_THREADS if threads is None else threads  # type: ignore[attr-defined]
     parts = max(1, min(most, len(slots), len(slots) * samples // WORTH_A_THREAD))

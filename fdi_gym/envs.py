@@ -9,7 +9,7 @@ import numpy as np
 
 from fdi_gym.engine import Record, advance, simulate
 from fdi_gym.faults import FaultScenario
-from fdi_gym.flights import Flights
+from fdi_gym.flights import Chunk, Flights
 from fdi_gym.plant import Array, Plant
 from fdi_gym.rules import Rules, Specified, ahead, checked_seed
 
@@ -76,9 +76,12 @@ class FDIEnv(Specified, gym.Env):
         render_mode: str | None = None,
         **options: Any,
     ):
+        self._set_up(Rules(plant, task, process, scenario, mismatch, decision_period, units, options), render_mode)
+
+    def _set_up(self, rules: Rules, render_mode: str | None) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"unknown render_mode {render_mode!r}; there are {self.metadata['render_modes']}")
-        self._rules = Rules(plant, task, process, scenario, mismatch, decision_period, units, options)
+        self._rules = rules
         self.plant = self._rules.plant
         self.observation_space, self.action_space = self._rules.observation_space, self._rules.action_space
         self.render_mode = render_mode
@@ -117,8 +120,7 @@ class FDIEnv(Specified, gym.Env):
     def _fly(self) -> None:
         """Fly on, and keep of the samples before what a block may still reach back to."""
         assert self._flights is not None
-        self._ahead = ahead(self._ahead, self._rules.period)
-        chunk = advance(self._flights, self._ahead)
+        chunk = self._advance(self._flights)
         obs, theta, label = chunk.obs[:, 0], chunk.theta[:, 0], chunk.label[:, 0].tolist()
         target = self.plant.estimate_target(theta, self.plant.split(obs)[1])
         monitored = {name: a.tolist() for name, a in self.plant.monitor(chunk.state[:, 0]).items()}
@@ -133,6 +135,11 @@ class FDIEnv(Specified, gym.Env):
         self._obs, self._theta, self._target, self._label, self._monitored = obs, theta, target, label, monitored
         self._base, self._flown = self._flown - max(keep, 0), self._flown + self._ahead
         self._length, self._terminated = int(self._flights.length[0]), bool(self._flights.terminated[0])
+
+    def _advance(self, flights: Flights) -> Chunk:
+        """The samples that are flown next; the flight is some way ahead, since what is said of it does not reach it."""
+        self._ahead = ahead(self._ahead, self._rules.period)
+        return advance(flights, self._ahead)
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Judge the diagnosis of the interval that ended at the current sample, and fly on to the next observation.
@@ -186,8 +193,13 @@ class FDIEnv(Specified, gym.Env):
         if self._canvas is None:
             self._canvas = Canvas(self.plant, self._rules.task.name, window=self.render_mode == "human")
         if self._record is None:
-            self._record = simulate(self.plant, [self.scenario])
+            self._record = self._whole()
         return self._canvas.draw(self._record, self._k, self._declared)
+
+    def _whole(self) -> Record:
+        """The flight from its beginning, as a picture shows it."""
+        assert self.scenario is not None
+        return simulate(self.plant, [self.scenario])
 
     def close(self) -> None:
         """Close the window, if there is one."""

@@ -74,6 +74,7 @@ class Flights:
     Attributes:
         k: (N,) the sample that each flight comes to next; the last one where it is over.
         length: (N,) its last sample: as the scenario says, until it ends early.
+        q: (N, n_q) the parameters of each flight's controller: the plant's, until somebody changes them in place.
 
     Raises:
         ValueError: A scenario that the plant refuses, noise of another shape, or a kernel that reaches beyond its arrays.
@@ -96,6 +97,7 @@ class Flights:
         self.seed, self.status = np.zeros(n, np.uint64), np.full(n, OVER, np.int64)
         self.x, self.c, self.u = np.zeros((n, n_x)), np.zeros((n, len(plant.c0))), np.zeros((n, n_u))
         self.theta, self.p = np.zeros((n, n_theta)), np.zeros((n, len(plant.nominal_p)))
+        self.q = np.zeros((n, len(plant.q)))
         self.readings, self.history = np.zeros((n, 2, n_y)), np.zeros((n, longest_lag + 1 if longest_lag else 0, n_y))
         self.reporting, self.dropped = np.zeros((0, n_y, closed_loop.REPORTING)), np.zeros((0, n_y))
         self.effects, self.held = np.zeros((n, 1, closed_loop.COLUMNS)), np.zeros((n, 1))
@@ -158,7 +160,7 @@ class Flights:
         if not made:
             return
         self.k[where], self.status[where], self.x[where], self.c[where] = 0, FLYING, plant.trim_state, plant.c0
-        self.u[where], self.theta[where] = plant.trim_command, plant.nominal_theta
+        self.u[where], self.theta[where], self.q[where] = plant.trim_command, plant.nominal_theta, plant.q
         self.length[where] = [flight.scenario.steps for flight in made]
         self.seed[where] = np.array([flight.scenario.noise_seed for flight in made], np.uint64)
         self.p[where] = [flight.inputs.physical for flight in made]
@@ -260,7 +262,7 @@ class Flights:
         """Tables and state in the order of the compiled call."""
         return (
             self.seed, self.length, *self.addresses, *self.steps,
-            self.p, self.effects, self.counts, self.values, self.labels,
+            self.p, self.q, self.effects, self.counts, self.values, self.labels,
             self.reporting, self.k, self.status, self.x, self.c, self.u, self.theta, self.held, self.readings, self.history,
             self.dropped,
         )  # fmt: skip

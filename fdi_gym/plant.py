@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from fdi_gym.acting import Acting
 from fdi_gym.checks import check_declaration, check_scenario, twice, unknown
 from fdi_gym.data_sheet import FaultMode, Kernels, Label, Signal, squared_error
 from fdi_gym.faults import FaultProcess, FaultScenario
@@ -103,6 +104,7 @@ class Plant(Truth):
         quaternions: Outputs that are a quaternion known up to its sign: the positions of its vector part (3) and of the
             sign of its scalar part, for each.
         noise_limit: The white noise of sensors and states is clipped at so many standard deviations. Default: never.
+        acting: How it can be acted on: probes, accommodation, and what they cost. Default: not at all.
         isolation_reward: (labels, labels): reward of declaring column while row is true. Default: 1 if right, else 0.
         identification_reward: Reward of an error (..., n). Default: minus the squares, scaled.
     """
@@ -142,6 +144,7 @@ class Plant(Truth):
     shapes: Shapes = OPEN
     quaternions: tuple[tuple[int, int, int, int], ...] = ()
     noise_limit: float = np.inf
+    acting: Acting | None = None
     isolation_reward: Array | None = None
     identification_reward: Callable[[Array], Array] | None = None
 

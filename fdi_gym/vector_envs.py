@@ -9,13 +9,14 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from fdi_gym import rules
-from fdi_gym.engine import Record, advance, simulate
+from fdi_gym.engine import Added, Record, advance, simulate
 from fdi_gym.faults import FaultScenario
 from fdi_gym.flights import Flights, Prepared
 from fdi_gym.next_flights import NextFlights
 from fdi_gym.plant import Array, Plant
-from fdi_gym.rules import Rules, Specified, ahead, checked_mask, checked_seeds, whole
+from fdi_gym.rules import CHUNK, Rules, Specified, ahead, checked_mask, checked_seeds, whole
+
+NOTHING = Added()
 
 
 class FDIVectorEnv(Specified, VectorEnv):
@@ -51,6 +52,12 @@ class FDIVectorEnv(Specified, VectorEnv):
         truth: bool = True,
         **options: Any,
     ):
+        rules = Rules(plant, task, process, scenario, mismatch, decision_period, units, options)
+        self._set_up(rules, num_envs, render_mode, autoreset_mode, truth)
+
+    def _set_up(
+        self, rules: Rules, num_envs: int, render_mode: str | None, autoreset_mode: str | AutoresetMode, truth: bool
+    ) -> None:
         num_envs = whole("num_envs", num_envs, 1)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"unknown render_mode {render_mode!r}; there are {self.metadata['render_modes']}")
@@ -61,7 +68,7 @@ class FDIVectorEnv(Specified, VectorEnv):
         except ValueError:
             allowed = [mode.value for mode in AutoresetMode]
             raise ValueError(f"unknown autoreset_mode {autoreset_mode!r}; there are {allowed}") from None
-        self._rules = Rules(plant, task, process, scenario, mismatch, decision_period, units, options)
+        self._rules = rules
         self.plant, self.num_envs, self.render_mode = self._rules.plant, num_envs, render_mode
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.single_observation_space = self._rules.observation_space
@@ -139,7 +146,7 @@ class FDIVectorEnv(Specified, VectorEnv):
         if self._flights is None:
             self._flights = Flights(self.plant, scenarios)
             period = self._rules.period
-            self._buffer = self._flights.blank(period + ahead(rules.CHUNK, period))
+            self._buffer = self._flights.blank(period + self._next_chunk(CHUNK))
             self._target = self._buffer.theta if self.plant.target is None else \
                 np.zeros((*self._buffer.label.shape, len(self.plant.estimated)))  # fmt: skip
             self._row = np.zeros(self.num_envs, np.int64)
@@ -148,17 +155,21 @@ class FDIVectorEnv(Specified, VectorEnv):
                 slots, [flight or self._flights.prepare(s) for flight, s in zip(prepared, scenarios, strict=True)]
             )
         if slots.size == self.num_envs:
-            self._now, self._ahead = self._rules.period - 1, ahead(0, self._rules.period)
+            self._now, self._ahead = self._rules.period - 1, self._next_chunk(None)
             self._filled = self._now + 1 + self._ahead
         self._k[slots], self._over[slots], self._row[slots] = 0, False, self._now
         self._waits, self._fresh = bool(self._over.any()), True
         self._fly(self._now, slots)
 
-    def _fly(self, first: int, slots: Array) -> None:
+    def _next_chunk(self, before: int | None) -> int:
+        """How many samples are flown next, after so many (None: after the first one): some way ahead of the agent."""
+        return ahead(before or 0, self._rules.period)
+
+    def _fly(self, first: int, slots: Array, added: Added = NOTHING) -> None:
         """Fly these flights from this row on to where all end."""
         flights = self._flights
         assert flights is not None
-        advance(flights, self._filled - first, self._buffer, first, slots)
+        advance(flights, self._filled - first, self._buffer, first, slots, added.inputs, added.references)
         rows = slice(first, self._filled)
         where: Any = rows if slots.size == self.num_envs else (rows, slots)
         obs, _, theta, _ = self._buffer
@@ -170,12 +181,16 @@ class FDIVectorEnv(Specified, VectorEnv):
         m = self._rules.period
         for array in {id(a): a for a in (*self._buffer, self._target)}.values():
             array[:m] = array[self._now - m + 1 : self._now + 1].copy()
-        self._now, self._ahead = m - 1, ahead(self._ahead, m)
+        self._now, self._ahead = m - 1, self._next_chunk(self._ahead)
         self._filled = m + self._ahead
-        self._fly(m, self._all)
+        self._fly(m, self._all, self._added())
         if self._mode is not AutoresetMode.DISABLED:
             under_way = np.flatnonzero(~self._over)
             self._next.plan(under_way, (self._flights.length - self._k)[under_way] // m)  # type: ignore[union-attr]
+
+    def _added(self) -> Added:
+        """What is added to the flights in the chunk that is flown next (see `advance`): nothing."""
+        return NOTHING
 
     def _prepared(self, seed: int) -> Prepared:
         """The flight of an episode's seed."""
@@ -302,8 +317,12 @@ class FDIVectorEnv(Specified, VectorEnv):
             self._canvas = Canvas(self.plant, self._rules.task.name)
         for i, scenario in enumerate(self.scenarios):
             if i not in self._records and scenario is not None:
-                self._records[i] = simulate(self.plant, [scenario])
+                self._records[i] = self._whole(i, scenario)
         return tuple(self._canvas.draw(self._records[i], int(self._k[i]), self._declared[i]) for i in range(self.num_envs))
+
+    def _whole(self, i: int, scenario: FaultScenario) -> Record:
+        """The flight of an environment from its beginning, as a picture shows it."""
+        return simulate(self.plant, [scenario])
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the canvas."""

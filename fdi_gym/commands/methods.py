@@ -15,6 +15,9 @@ def fit(
     diagnosers: Names = ("all",),
     jobs: int = -1,
     output: Path | None = None,
+    renew: bool = False,
+    count: int = 4,
+    seed: int | None = None,
 ) -> None:
     """Fit what methods know of a plant, for all suites of it that are here: beliefs, and calibrations on healthy flights.
 
@@ -24,8 +27,15 @@ def fit(
             What the file holds of others stays where names are given, as long as the plant's code is the one that it is of.
         jobs: Worker processes, -1 for one per core.
         output: Folder that gets PLANT.json. Default: `fits` in the package of the methods, whence they are read.
+        renew: The plant's file has changed and its flights should not have: find some of the fits anew, and where they are
+            the same bytes write the present digest of the code into the file.
+        count: So many beliefs and calibrations are found anew then.
+        seed: Which ones. Default: drawn anew each time.
     """
+    import secrets
+
     from fdi_gym.diagnosis import find_diagnoser, knowledge, named
+    from fdi_gym.diagnosis.registry import package_of
     from fdi_gym.listing import find_plant
     from fdi_gym.suite import load_suite, suite_names
 
@@ -36,6 +46,12 @@ def fit(
     suites = [suite for suite in map(load_suite, suite_names()) if suite.plant == plant_id]
     if not entries or not suites:
         raise ValueError(f"nothing to fit: {len(suites)} suites of {plant_id}, {len(entries)} methods that take a belief")
+    if renew:
+        for path in {(package_of(entry) or Path()) / "fits" / f"{plant_id}.json" for entry in entries}:
+            seed = secrets.randbits(32) if seed is None else seed
+            knowledge.write_fits(path, knowledge.renewed(path, entries, suites, count, seed))
+            print(f"{count} beliefs and {count} calibrations (seed {seed}) are the same bytes; {path} is of this code now")
+        return
     for path, found in knowledge.fit_suites(entries, suites, jobs).items():
         place = path if output is None else output / path.name
         if diagnosers != ("all",):

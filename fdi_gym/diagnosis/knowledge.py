@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
 from fdi_gym.diagnosis import fitting
 from fdi_gym.diagnosis.fitting import fit_belief, fit_calibration
@@ -177,13 +178,8 @@ class Task(NamedTuple):
     settings: Mapping[str, Any]
 
 
-def fit_suites(entries: Sequence[Entry], suites: Sequence[Any], jobs: int = -1) -> dict[Path, Fits]:
-    """The fits of methods on the suites of one plant, found anew, side by side; by the file that they belong into.
-
-    Methods that cannot run on the plant have none.
-    """
-    import joblib
-
+def tasks_of(entries: Sequence[Entry], suites: Sequence[Any]) -> dict[str, Task]:
+    """What is to be fitted of methods for suites of one plant, by the keys of the calibrations."""
     tasks: dict[str, Task] = {}
     for suite in suites:
         built = suite.build()
@@ -194,6 +190,17 @@ def fit_suites(entries: Sequence[Entry], suites: Sequence[Any], jobs: int = -1) 
             settings = entry.resolve(plant, **suite.settings.get(entry.name, {}))
             key = calibration_key(entry, plant, suite.process, settings)
             tasks[key] = Task(entry, plant, suite.process, settings)
+    return tasks
+
+
+def fit_suites(entries: Sequence[Entry], suites: Sequence[Any], jobs: int = -1) -> dict[Path, Fits]:
+    """The fits of methods on the suites of one plant, found anew, side by side; by the file that they belong into.
+
+    Methods that cannot run on the plant have none.
+    """
+    import joblib
+
+    tasks = tasks_of(entries, suites)
     wanted = {belief_key(t.plant, t.process): t for t in tasks.values() if t.entry.takes("belief")}
     made = joblib.Parallel(jobs)(joblib.delayed(_belief)(t.plant, t.process) for t in wanted.values())
     beliefs: dict[str, Belief | None] = dict(zip(wanted, made, strict=True))
@@ -217,6 +224,40 @@ def fit_suites(entries: Sequence[Entry], suites: Sequence[Any], jobs: int = -1) 
         if (calibration := found.get(key)) is not None:
             fits.calibrations[key] = calibration
     return files
+
+
+def renewed(path: Path, entries: Sequence[Entry], suites: Sequence[Any], count: int, seed: int) -> Fits:
+    """A plant's file with the digest of the code that is here, where that code gives the same fits.
+
+    Args:
+        path: The file.
+        entries, suites: Methods, and suites of the plant, for which there are fits in it.
+        count: So many beliefs and calibrations are found anew, drawn at random, and compared to the byte.
+        seed: Of that draw.
+
+    Raises:
+        ValueError: One is another now: the plant's flights have changed, and all are to be fitted anew.
+    """
+    fits = from_json(path.read_bytes(), Fits)
+    tasks = tasks_of(entries, suites)
+    beliefs = {belief_key(t.plant, t.process): t for t in tasks.values()}
+    rng = np.random.default_rng(seed)
+    for kind, by_key, held in (
+        ("belief", beliefs, fits.beliefs), ("calibration", tasks, fits.calibrations),
+    ):  # fmt: skip
+        there = sorted(key for key in by_key if key in held)
+        for key in rng.permutation(there)[:count].tolist():
+            task = by_key[key]
+            believed = fits.beliefs.get(belief_key(task.plant, task.process))
+            if kind == "belief":
+                found: Any = fit_belief(task.plant, task.process)
+            else:
+                found = fit_calibration(
+                    task.entry, task.plant, task.process, task.settings, believed if task.entry.takes("belief") else None
+                )
+            if to_json(found) != to_json(held[key]):
+                raise ValueError(f"{path}: the {kind} {key} is another now; fit the plant anew")
+    return msgspec.structs.replace(fits, code=code_digest(next(iter(tasks.values())).plant))
 
 
 def _belief(plant: Plant, process: str) -> Belief | None:

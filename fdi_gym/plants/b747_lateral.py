@@ -23,6 +23,9 @@ Closed loops follow a bank-angle reference with a discrete LQR state feedback on
 over a sample, so the zero-order-hold discretisation is exact. Mismatch multiplies every entry of the first three rows
 of A and of B by 1 + level * U(-1, 1).
 
+A diagnosis can act: doublets of either surface as probes (the process "quiet" has no other excitation); a weak surface is
+asked for more and a stuck one is left out of the loop, whose gain is designed anew for the other, which trims against it.
+
 The flight ends early where the linear model stops to mean anything: |phi| > 60 deg or |beta| > 15 deg.
 
 Source: A. Guven, C. Hajiyev, WSEAS Transactions on Signal Processing 19, 2023, doi 10.37394/232014.2023.19.4 (A, B, fault
@@ -43,6 +46,7 @@ import numpy as np
 import scipy.linalg
 from msgspec import UNSET, Meta, UnsetType
 
+from fdi_gym.acting import Acting, Probe, square
 from fdi_gym.drawing import uniform
 from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Hold, Scoring
 from fdi_gym.kernels import kernel
@@ -178,12 +182,15 @@ def output(t, x, u, theta, d, p, y):
 
 @kernel
 def control(t, y, r, q, c, u):
-    """u = clip(e - K (y - [0, 0, 0, phi_ref])); K = 0 in the open loop. r = (e_aileron, e_rudder, phi_ref)."""
+    """u = clip(s e + o - K (y - [0, 0, 0, phi_ref])); K = 0 in the open loop. r = (e_aileron, e_rudder, phi_ref).
+
+    q = the gain K (2, 4) row by row, travel (2), and for the pilot's command the factor s (2) and the offset o (2).
+    """
     for i in range(2):
         feedback = (
             q[4 * i] * y[0] + q[4 * i + 1] * y[1] + q[4 * i + 2] * y[2] + q[4 * i + 3] * (y[3] - r[2])
         )  # fmt: skip
-        u[i] = min(max(r[i] - feedback, -q[8 + i]), q[8 + i])
+        u[i] = min(max(q[10 + i] * r[i] + q[12 + i] - feedback, -q[8 + i]), q[8 + i])
 
 
 @kernel
@@ -334,6 +341,13 @@ def processes(airframe: str, closed: bool, dual: bool) -> list[FaultProcess]:
         }  # fmt: skip
         return standard(rng).replace(disturbance=disturbance)
 
+    def quiet(rng: np.random.Generator) -> FaultScenario:
+        return standard(rng).replace(reference={"command": "zero"})
+
+    def banking(rng: np.random.Generator) -> FaultScenario:
+        flown = standard(rng)
+        return flown.replace(reference={"command": "zero", "bank_levels": flown.reference["bank_levels"]})
+
     def hard_over(rng: np.random.Generator) -> FaultScenario:
         i, onset = int(rng.integers(2)), int(rng.integers(200, 801))
         return flight(rng, [stuck(SURFACES[i], U_MAX[i] * float(rng.choice([-1, 1])), onset, kind="hard-over")])
@@ -347,10 +361,14 @@ def processes(airframe: str, closed: bool, dual: bool) -> list[FaultProcess]:
         FaultProcess(name="hard", description="intermittent faults, plant off the model by 5 %", sample=hard,
                      scoring=Scoring(start=151, grace=50)),
         FaultProcess(name="gust", description="the standard faults, and one lateral gust in every flight", sample=gusty),
+        FaultProcess(name="quiet", description="the standard faults in level flight, no excitation", sample=quiet),
         FaultProcess(name="hard-over", description="a surface runs to its limit", sample=hard_over),
         FaultProcess(name="float", description="a surface floats at zero", sample=floating),
     ]  # fmt: skip
-    if not closed:
+    if closed:
+        found.append(FaultProcess(name="banking", description="the standard faults while the autopilot follows bank levels",
+                                  sample=banking))  # fmt: skip
+    else:
         found.append(FaultProcess(name="paper", description="the source's: rudder stuck at 2 deg, 200 to 600 s",
                                   sample=lambda rng: paper(), scoring=Scoring(decision="second_half")))  # fmt: skip
     if dual:
@@ -382,6 +400,53 @@ def _labels(dual: bool) -> tuple[Label, ...]:
     return tuple(Label(" + ".join(modes) or "none", frozenset(modes)) for modes in both)
 
 
+PROBES = (
+    Probe("aileron", "a doublet of the aileron by 3 deg, 2 s each way, every 10 s", command=square(40, (3.0, 0.0), 60)),
+    Probe("rudder", "a doublet of the rudder by 1.2 deg, 2 s each way, every 10 s", command=square(40, (0.0, 1.2), 60)),
+    Probe("both", "the doublets of both surfaces at once", command=square(40, (3.0, 1.2), 60)),
+)  # fmt: skip
+STUCK = 0.1  # effectiveness below which a surface is left out
+
+
+def regulator(Ad: np.ndarray, Bd: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """The gain (inputs, 4) of the discrete LQ regulator."""
+    P = scipy.linalg.solve_discrete_are(Ad, Bd, Q, R)
+    return np.linalg.solve(R + Bd.T @ P @ Bd, Bd.T @ P @ Ad)
+
+
+def acting(airframe: str, Ad: np.ndarray, Bd: np.ndarray, gain: np.ndarray) -> Acting:
+    """How the loop with this gain is acted on. The flight costs what its regulator minimises, over (5 deg of bank)^2."""
+    Q, R = LQR[airframe]
+
+    @functools.lru_cache(maxsize=4096)
+    def designed(aileron: float, rudder: float) -> tuple[np.ndarray, np.ndarray]:
+        """Gain (2, 4) for surfaces of this effectiveness; what the other one deflects per deg of one that is stuck (2,)."""
+        left = np.array([aileron, rudder])
+        K = gain if (left == 1.0).all() or not gain.any() else regulator(Ad, Bd * left, Q, R)
+        trims = np.zeros(2)
+        for i, j in ((0, 1), (1, 0)):  # so that the steady state costs least
+            if left[i] == 0.0 < left[j]:
+                settled = np.linalg.solve(np.eye(4) - Ad + Bd * left @ K, Bd)
+                trims[i] = settled[:, i] @ Q @ settled[:, j] / (settled[:, j] @ Q @ settled[:, j])
+        return K, trims
+
+    def flight_cost(x: np.ndarray, u: np.ndarray, r: np.ndarray) -> np.ndarray:
+        error = x - np.stack([*[np.zeros_like(r[..., 2])] * 3, r[..., 2]], axis=-1)
+        return ((error**2 * np.diag(Q)).sum(axis=-1) + (u**2 * np.diag(R)).sum(axis=-1)) / 25.0
+
+    def accommodate(theta: np.ndarray) -> np.ndarray:
+        left = 1.0 + np.clip(theta[:, :2], -1.0, 0.0)
+        left = np.where(left < STUCK, 0.0, np.maximum(np.round(left, 2), STUCK))
+        pairs = [designed(*row) for row in left.tolist()]
+        K, trims = (np.stack(parts).reshape(len(left), -1) for parts in zip(*pairs, strict=True))
+        stuck, b = left == 0.0, theta[:, 2:]
+        factor = np.where(stuck, 0.0, 1.0 / np.maximum(left, STUCK))
+        offset = np.where(stuck, 0.0, 0.0 - b - (trims * np.where(stuck, b, 0.0))[:, ::-1]) * factor
+        return np.concatenate([K, np.tile(U_MAX, (len(left), 1)), factor, offset], axis=1)
+
+    return Acting(flight_cost=flight_cost, lost=100.0, probes=PROBES, accommodate=accommodate)
+
+
 def plant(*, variant: str = "printed/open", labels: str = "single") -> Plant:
     """Build the plant.
 
@@ -399,12 +464,8 @@ def plant(*, variant: str = "printed/open", labels: str = "single") -> Plant:
         raise ValueError(f"unknown labels {labels!r}; {ID} has single, dual")
     airframe, loop = variant.split("/")
     A, B = (A_PRINTED, B_PRINTED) if airframe == "printed" else bare_airframe()
-    gain = np.zeros((2, 4))
-    if loop == "closed":
-        Ad, Bd = discretise(A, B)
-        Qc, Rc = LQR[airframe]
-        P = scipy.linalg.solve_discrete_are(Ad, Bd, Qc, Rc)
-        gain = np.linalg.solve(Rc + Bd.T @ P @ Bd, Bd.T @ P @ Ad)
+    Ad, Bd = discretise(A, B)
+    gain = regulator(Ad, Bd, *LQR[airframe]) if loop == "closed" else np.zeros((2, 4))
 
     def physical(changes: Mapping[str, Any]) -> np.ndarray:
         A_true, B_true = A.copy(), B * np.array(changes.get("factor_B", 1.0))
@@ -431,7 +492,8 @@ def plant(*, variant: str = "printed/open", labels: str = "single") -> Plant:
         ),
         modes=_modes(airframe), labels=_labels(labels == "dual"),
         processes=processes(airframe, loop == "closed", labels == "dual"),
-        q=np.concatenate([gain.ravel(), U_MAX]), physical=physical, perturb=perturb, reference=reference_rows,
+        q=np.concatenate([gain.ravel(), U_MAX, [1.0, 1.0, 0.0, 0.0]]), physical=physical, perturb=perturb,
+        reference=reference_rows,
         disturbances=(Signal("beta_g", "deg", -15.0, 15.0, 1.0),), disturbance=gust_rows,
-        shapes=Shapes(Reference, Gust, Physical),
+        shapes=Shapes(Reference, Gust, Physical), acting=acting(airframe, Ad, Bd, gain),
     )  # fmt: skip

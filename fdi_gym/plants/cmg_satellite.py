@@ -30,6 +30,9 @@ Control is the sliding-mode law tau_c = -p0 (w_e + sgn(q_e4) q_e) with the comma
 diagnosers know the nominal A, E, Js. Mismatch level m: each axis of Js is off by a factor 1 + m U(-1, 1), each CMG is
 mounted off by U(-o, o) about its gimbal axis, o = 0.5 deg at m = 0.01 and 1 deg at m = 0.03.
 
+A diagnosis can act: null motion and small common moves of all gimbals as probes; the steering law weights each CMG by its
+effectiveness.
+
 Labels are the 16 sets of faulty units. Processes: "standard" (also "bench": one window of 20 to 45 s), "hard" (the
 units fail and recover independently, mismatch 0.01), "fault-free", "paper" (also "table4": the source's time line), and
 "table5" (the source's random ranges; under "slew" also called "paper-slew").
@@ -57,6 +60,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
+from fdi_gym.acting import Acting, Probe, square
 from fdi_gym.checks import number
 from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Scoring
 from fdi_gym.kernels import kernel
@@ -261,9 +265,17 @@ _determinant = kernel(determinant)
 
 @kernel
 def control(t, y, r, q, c, u):
-    """Gimbal rates r = A' (A A' + lam Es)^-1 hdot / h0. q = (1 for robust or 0 for pinv, amplitude of null motion)."""
+    """Gimbal rates r = A' (A A' + lam Es)^-1 hdot / h0, with the columns of A weighted by the effectiveness.
+
+    q = 1 for robust or 0 for pinv, amplitude of the null motion, effectiveness that is allowed for (4).
+    """
     hdot1, hdot2, hdot3 = commanded_hdot(y, r)
     A, _ = _pyramid(y[6], y[7], y[8], y[9])
+    A = (
+        (q[2] * A[0][0], q[3] * A[0][1], q[4] * A[0][2], q[5] * A[0][3]),
+        (q[2] * A[1][0], q[3] * A[1][1], q[4] * A[1][2], q[5] * A[1][3]),
+        (q[2] * A[2][0], q[3] * A[2][1], q[4] * A[2][2], q[5] * A[2][3]),
+    )
     m11, m12, m13, m22, m23, m33 = gram(A)
     _, _, _, det = solve3(m11, m12, m13, m22, m23, m33, 0.0, 0.0, 0.0)
     lam = q[0] * 0.01 * np.exp(-10.0 * det)
@@ -500,6 +512,20 @@ def sensor_sigma(profile: str, snr: float) -> np.ndarray:
     return np.repeat(RMS[profile], (3, 3, 4)) * 10 ** (-snr / 20)
 
 
+def flight_cost(x: np.ndarray, u: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """The attitude error over 0.5 deg and a tenth of the gimbal rates over 0.5 rad/s, squared."""
+    e4 = np.abs((x[..., :4] * r[..., :4]).sum(axis=-1))
+    angle = 2.0 * np.arccos(np.minimum(e4, 1.0))
+    return (angle / np.deg2rad(0.5)) ** 2 + 0.1 * ((u / 0.5) ** 2).sum(axis=-1)
+
+
+PROBES = (
+    Probe("null", "null motion of the gimbals, 0.05 n(d) at a period of 7 s, which puts no torque on a healthy satellite",
+          parameters=np.array([0.0, NULL_AMPLITUDE, 0.0, 0.0, 0.0, 0.0])),
+    Probe("common", "all gimbals together by 0.02 rad/s, to and fro for 1 s each", command=square(200, [0.02] * 4)),
+)  # fmt: skip
+
+
 def plant(
     *,
     reference: str = "slew",
@@ -528,17 +554,22 @@ def plant(
         mounting = np.deg2rad(changes.get("mounting_error_deg", [0.0] * 4))
         return np.concatenate([js, mounting, [float(fault_model == "wheel")]])
 
+    q = np.array([float(steering == "robust"), NULL_AMPLITUDE if excitation == "null" else 0.0, 1.0, 1.0, 1.0, 1.0])
+
+    def accommodate(f: np.ndarray) -> np.ndarray:
+        return np.concatenate([np.tile(q[:2], (len(f), 1)), np.clip(f, 0.05, 1.0)], axis=1)
+
     x0, sigma = start(reference), sensor_sigma(reference, snr)
-    q = [Signal(f"q{i + 1}", "", -1.1, 1.1, 0.1, nominal=x0[i]) for i in range(4)]
+    attitude = [Signal(f"q{i + 1}", "", -1.1, 1.1, 0.1, nominal=x0[i]) for i in range(4)]
     w = [Signal(f"w{i + 1}", "rad/s", -20.0, 20.0, 0.05, SIGMA_Q, x0[4 + i]) for i in range(3)]
     d = [Signal(f"d{i + 1}", "rad", -2500.0, 2500.0, 0.2) for i in range(4)]
-    seen = [*q[:3], *w, *(s._replace(period=2 * np.pi) for s in d)]
+    seen = [*attitude[:3], *w, *(s._replace(period=2 * np.pi) for s in d)]
     return Plant(
         id=ID, version=VERSION, options=options,
         description="Satellite with four control moment gyros: loss of effectiveness of any subset",
         dt=DT, substeps=1,
         kernels=Kernels(dynamics, output, control, known, project, outside),
-        states=(*q, *w, *d),
+        states=(*attitude, *w, *d),
         outputs=(*(s._replace(sigma=float(v), nominal=0.0) for s, v in zip(seen, sigma, strict=True)),
                  Signal("sign q4", "", -1.0, 1.0)),
         commands=tuple(Signal(f"r{i + 1}", "rad/s", -R_MAX, R_MAX, 0.5) for i in range(4)),
@@ -553,11 +584,12 @@ def plant(
         ),
         labels=tuple(Label(" + ".join(UNITS[i] for i in s) or "none", frozenset(UNITS[i] for i in s)) for s in SETS),
         processes=processes(reference),
-        q=np.array([float(steering == "robust"), NULL_AMPLITUDE if excitation == "null" else 0.0]),
+        q=q,
         true_feedback=feedback == "true", physical=physical, perturb=perturb,
         reference=lambda scenario: _rows(reference, scenario.steps),
         shapes=Shapes(Slew if reference == "slew" else Regulate, Nothing, Physical),
         quaternions=((0, 1, 2, 10),),
         monitor=lambda state: {"det": singularity(state[..., 7:])},
         isolation_reward=np.eye(16) - 1.0, identification_reward=lambda error: -np.abs(error).mean(axis=-1),
+        acting=Acting(flight_cost=flight_cost, lost=100.0, probes=PROBES, accommodate=accommodate),
     )  # fmt: skip

@@ -27,6 +27,9 @@ Gusts: each component builds up as 1 - cos, holds, and dies down. `kappa` is the
 coupling that is kept: 0 a force-only gust (the source's setting), 1 the physical one, where a side gust looks like a
 pedal fault; the level of difficulty.
 
+A diagnosis can act: small sines of the cyclic, the pedal or the collective as probes (in the process "quiet" nothing else
+moves an actuator); the mixing subtracts the actuator errors that are estimated.
+
 The flight ends early beyond 60 deg of roll or pitch, 20 m/s or 8 rad/s in any axis: a stuck or floating cyclic can
 bring that about. Mismatch multiplies mass and inertias by 1 + level * U(-1, 1).
 
@@ -58,6 +61,7 @@ import numpy as np
 import scipy.linalg
 from msgspec import UNSET, Meta, UnsetType
 
+from fdi_gym.acting import Acting, Probe
 from fdi_gym.checks import number
 from fdi_gym.drawing import random_sign, uniform
 from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Hold, Samples, Scoring, Square
@@ -173,7 +177,7 @@ def control(t, y, r, q, c, u):
     """LQI with clipped errors and an observer of the stabiliser bar. c = integrals (4), observed flapping (2).
 
     q = the gain K (4, 15) row by row, trim command (4), trim of the outputs (9), trim flapping (2), K_H, decay of the
-    observer over a sample.
+    observer over a sample, actuator errors that are allowed for (4).
     """
     k_h, decay = q[75], q[76]
     for i in range(4):
@@ -189,11 +193,12 @@ def control(t, y, r, q, c, u):
             u[i] -= q[15 * i + 9 + j] * (c[4 + j] - q[73 + j])
         for j in range(4):
             u[i] -= q[15 * i + 11 + j] * c[j]
+        u[i] -= q[77 + i]
         u[i] = min(max(u[i], U_MIN[i]), U_MAX[i])
     for j in range(4):
         c[j] = min(max(c[j] + DT * y[INTEGRATED[j]], -INTEGRAL_CLIP), INTEGRAL_CLIP)
-    c[4] = decay * c[4] + (1.0 - decay) * TAU_F * (-y[4] + k_h / TAU_F * u[1])
-    c[5] = decay * c[5] + (1.0 - decay) * TAU_F * (-y[3] + k_h / TAU_F * u[2])
+    c[4] = decay * c[4] + (1.0 - decay) * TAU_F * (-y[4] + k_h / TAU_F * (u[1] + q[78]))
+    c[5] = decay * c[5] + (1.0 - decay) * TAU_F * (-y[3] + k_h / TAU_F * (u[2] + q[79]))
 
 
 @kernel
@@ -449,6 +454,15 @@ def perturb(rng: np.random.Generator, level: float) -> dict[str, float]:
     return {name: float(value * (1 + level * rng.uniform(-1, 1))) for name, value in nominal.items()}
 
 
+def quiet(rng: np.random.Generator) -> FaultScenario:
+    """Still air; in four flights of five one actuator loses effectiveness for good, for U(3, 12) s on."""
+    faults = []
+    if rng.random() >= 0.2:
+        c = int(rng.integers(4))
+        faults.append(loss(CHANNELS[c], uniform(rng, *LOSS[c]), round(uniform(rng, 3, 12) / DT)))
+    return FaultScenario(plant=ID, steps=STEPS, faults=faults)
+
+
 def _processes() -> list[FaultProcess]:
     scoring = Scoring(decision="second_half")
     found = [
@@ -456,6 +470,8 @@ def _processes() -> list[FaultProcess]:
                      scoring=scoring),
         FaultProcess(name="hard", description="the same, side gusts with the full weathercock coupling (kappa = 1)",
                      sample=lambda rng: sample(rng).replace(physical={"kappa": 1.0}), scoring=scoring),
+        FaultProcess(name="quiet", description="still air, a loss of effectiveness in four flights of five", sample=quiet,
+                     scoring=scoring),
         FaultProcess(name="paper", description="the source's scenario 1: biases on lat, lon and ped in turn",
                      sample=lambda rng: paper(1), scoring=scoring),
     ]  # fmt: skip
@@ -502,6 +518,25 @@ def _labels() -> tuple[Label, ...]:
     )
 
 
+def flight_cost(x: np.ndarray, u: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Velocities over 0.5 m/s, angles from trim over 0.1 rad, a tenth of the commands over 0.02 rad, squared."""
+    v, angles, effort = x[..., :3] / 0.5, (x[..., 6:9] - X_TRIM[6:9]) / 0.1, (u - U_TRIM) / 0.02
+    return (v**2).sum(axis=-1) + (angles**2).sum(axis=-1) + 0.1 * (effort**2).sum(axis=-1)
+
+
+def sine(period: int, amplitudes: tuple[float, float, float, float]) -> np.ndarray:
+    """Rows (period, 4) of one sine of these amplitudes [rad], the period in samples."""
+    return np.sin(2 * np.pi * np.arange(period) / period)[:, None] * np.array(amplitudes)
+
+
+PROBES = (
+    Probe("cyclic", "sines of lon and lat by 4 mrad, periods 0.5 s and 1 s",
+          command=np.concatenate([sine(25, (0.0, 4e-3, 0.0, 0.0))] * 2) + sine(50, (0.0, 0.0, 4e-3, 0.0))),
+    Probe("pedal", "a sine of ped by 10 mrad, period 0.5 s", command=sine(25, (0.0, 0.0, 0.0, 0.01))),
+    Probe("collective", "a sine of col by 5 mrad, period 0.5 s", command=sine(25, (5e-3, 0.0, 0.0, 0.0))),
+)  # fmt: skip
+
+
 def identification_reward(error: np.ndarray) -> np.ndarray:
     """Minus the mean over the channels of min(|error| / scale, 5)."""
     return -np.minimum(np.abs(error) / B_SCALE, 5.0).mean(axis=-1)
@@ -531,6 +566,13 @@ def plant(*, kappa: float = 0.3, K_B: float = 0.84) -> Plant:
     labels = _labels()
     accused = np.array([[c in label.modes for c in CHANNELS] for label in labels])
     wrongly = (accused[None] & ~accused[:, None]).sum(axis=2)
+
+    most = 1.25 * np.array(BIAS)[:, 1]  # beyond that an actuator is stuck, and to ask it for more is in vain
+
+    def accommodate(b: np.ndarray) -> np.ndarray:
+        return np.concatenate([np.tile(q, (len(b), 1)), np.clip(b, -most, most)], axis=1)
+
+    q = np.concatenate([K.ravel(), u_trim, x_trim, [p[5], np.exp(-DT / TAU_F)]])
     lim = (20.0, 20.0, 20.0, 8.0, 8.0, 8.0, np.pi / 3, np.pi / 3, np.inf, np.inf, np.inf)
     units = ("m/s",) * 3 + ("rad/s",) * 3 + ("rad",) * 5
     scales = (0.5,) * 3 + (0.2,) * 3 + (0.1,) * 3 + (0.01,) * 2
@@ -560,8 +602,9 @@ def plant(*, kappa: float = 0.3, K_B: float = 0.84) -> Plant:
         ) for i, c in enumerate(CHANNELS)),
         labels=labels, processes=_processes(),
         c0=np.concatenate([np.zeros(4), x_trim[9:]]),
-        q=np.concatenate([K.ravel(), u_trim, x_trim, [p[5], np.exp(-DT / TAU_F)]]),
+        q=np.concatenate([q, np.zeros(4)]),
         physical=physical, perturb=perturb, shapes=Shapes(Nothing, Gusts, Physical),
         isolation_reward=np.eye(len(labels)) - 0.5 * wrongly,
         identification_reward=identification_reward,
+        acting=Acting(flight_cost=flight_cost, lost=100.0, probes=PROBES, accommodate=accommodate),
     )  # fmt: skip

@@ -33,6 +33,9 @@ jam is abrupt. The identification task asks for theta. `jam` has no size beyond 
 The study's scenario and its mirror are noise-free: build the plant with `noise_scale=0`. Mismatch draws rho_1..6 in
 +-level and rho_7, rho_8 in +-5/8 level, the proportions of the process "hard".
 
+A diagnosis can act: a dither of the jet against which the fin moves, and small steps of the commanded incidence, as probes;
+the inversion allows for the estimated fault.
+
 The flight ends early where the airframe data end, |alpha| > 20 deg, or at |q| > 5 rad/s.
 
 Sources: R. T. Reichert, IEEE Control Systems Magazine 12(5), 1992 (airframe, fin); R. A. Nichols, R. T. Reichert, W.
@@ -53,6 +56,7 @@ import numpy as np
 import scipy.linalg
 from msgspec import UNSET, Meta, UnsetType
 
+from fdi_gym.acting import Acting, Probe, square
 from fdi_gym.checks import number
 from fdi_gym.drawing import random_sign, uniform
 from fdi_gym.faults import MAX_STEPS, Abrupt, Fault, FaultProcess, FaultScenario, Incipient, Scoring
@@ -92,6 +96,7 @@ MACH = 2.5  # of the study's scenario
 LOG_RATE, LOG_RATE_HARD = np.log([0.15, 2.0]).tolist(), np.log([0.5, 3.0]).tolist()  # of 1/s: how fast a fault grows
 ALPHA_MAX, Q_MAX = 20 * DEG, 5.0  # rad, rad/s: validity of the airframe data; loss of control
 MODES = ("aero", "leak", "finloss", "stuck", "jetloss")  # labels 1 to 5
+DITHER_PERIOD = 0.5  # s: of the jet, as a probe
 ENTRIES = ("theta_aero", "theta_leak", "theta_finloss", "jam", "theta_jetloss")
 
 
@@ -153,18 +158,31 @@ def known(t, r, c, out):
 
 
 @kernel
-def command(y, r, c, u):
-    """Two-time-scale inversion: slow loop alpha -> q_c, fast loop q -> v, allocated to jet and fin. Updates I."""
+def command(t, y, r, law, c, u):
+    """Two-time-scale inversion: slow loop alpha -> q_c, fast loop q -> v, allocated to jet and fin. Updates I.
+
+    law[6:11] is the fault parameter that the inversion allows for, law[11] the amplitude of the jet's dither.
+    """
     alpha, q, mach = y[0], y[1], r[1]
     delta_hat, alpha_r = c[0], c[4]
-    C_n = force(alpha, mach, A_N, B_N, C_N) + D_N * delta_hat
+    fin, jet = 1.0 - law[8], 1.0 - law[10]
+    C_n = force(alpha, mach, A_N, B_N, C_N) + fin * D_N * delta_hat
     q_c = OMEGA_A * (alpha_r - alpha) - K_ALPHA * mach * np.cos(alpha) * C_n
     e = q_c - q
     c[3] = min(max(c[3] + DT * OMEGA_Q * OMEGA_Q * e, -I_MAX), I_MAX)
     v = 2.0 * ZETA_Q * OMEGA_Q * e + c[3]
-    u[1] = min(max(JET_SHARE * v / L_J, -1.0), 1.0)
+    if law[6] != 0.0 or law[7] != 0.0:
+        v -= law[6] * K1 * K_Q * mach * mach * abs(B_M) * alpha * abs(alpha) + law[7] * L2 * np.exp(
+            -((alpha / ALPHA_J) ** 2)
+        )
     C_m0 = moment(alpha, mach, A_M, B_M, C_M)
-    delta_c = (v - L_J * u[1] - K_Q * mach * mach * C_m0) / (K_Q * mach * mach * D_M)
+    wanted = JET_SHARE * v / (jet * L_J)
+    if law[9] >= 0.5:  # the fin stands still somewhere: all is left to the jet
+        wanted = (v - K_Q * mach * mach * C_m0) / (jet * L_J)
+    if law[11] > 0.0:
+        wanted += law[11] * np.sin(2.0 * np.pi * t / DITHER_PERIOD)
+    u[1] = min(max(wanted, -1.0), 1.0)
+    delta_c = (v - jet * L_J * u[1] - K_Q * mach * mach * C_m0) / (K_Q * mach * mach * fin * D_M)
     u[0] = min(max(delta_c, -DELTA_MAX), DELTA_MAX)
 
 
@@ -172,9 +190,10 @@ def command(y, r, c, u):
 def control(t, y, r, q, c, u):
     """The command, then one sample of what the computer models: c = (delta^, its rate, j^, I, alpha_r, its rate).
 
-    r = (alpha_c, M). q holds the prefilter's exact zero-order-hold discretisation, row by row, then its input.
+    r = (alpha_c, M). q holds the prefilter's exact zero-order-hold discretisation, row by row, then its input (6); the fault
+    parameter that the inversion allows for (5); the amplitude of the jet's dither, against which the fin moves.
     """
-    command(y, r, c, u)
+    command(t, y, r, q, c, u)
     h = DT / SUBSTEPS
     for _ in range(SUBSTEPS):  # the same Runge-Kutta steps as the plant's, so that delta^ = delta without a fault
         p1, v1 = c[1], OMEGA_F * OMEGA_F * (u[0] - c[0]) - 2.0 * ZETA_F * OMEGA_F * c[1]
@@ -405,6 +424,27 @@ def _modes() -> tuple[FaultMode, ...]:
     )
 
 
+def flight_cost(x: np.ndarray, u: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """The incidence from what is commanded over 2 deg, and a tenth of fin over 15 deg and jet over 1, squared."""
+    error, fin = (x[..., 0] - r[..., 0]) / (2 * DEG), u[..., 0] / (15 * DEG)
+    return error**2 + 0.1 * (fin**2 + u[..., 1] ** 2)
+
+
+def accommodate(theta: np.ndarray) -> np.ndarray:
+    """q (n, 12) for an estimated theta (n, 5): it is allowed for in the inversion, as far as the effectors go."""
+    n, most = len(theta), np.array([1.5, 1.5, 0.8, 1.0, 0.8])
+    allowed = np.clip(theta, [-1.5, -1.5, 0.0, 0.0, 0.0], most)
+    return np.concatenate([np.tile(prefilter(), (n, 1)), allowed, np.zeros((n, 1))], axis=1)
+
+
+PROBES = (
+    Probe("dither", f"the jet by 0.2 at a period of {DITHER_PERIOD:g} s, and the fin against it: no moment without a fault",
+          parameters=np.array([0.0] * 11 + [0.2])),
+    Probe("incidence", "the commanded incidence by 1.5 deg, up and down for 0.5 s each",
+          reference=square(100, (1.5 * DEG, 0.0))),
+)  # fmt: skip
+
+
 def plant(*, noise_scale: float = 1.0, fault_scale: float = 1.0) -> Plant:
     """Build the plant.
 
@@ -448,7 +488,8 @@ def plant(*, noise_scale: float = 1.0, fault_scale: float = 1.0) -> Plant:
         modes=_modes(),
         labels=(Label("none", frozenset()), *(Label(name, frozenset({name})) for name in MODES)),
         processes=_processes(fault_scale),
-        c0=np.zeros(6), q=prefilter(), physical=physical, perturb=perturb,
+        c0=np.zeros(6), q=np.concatenate([prefilter(), np.zeros(6)]), physical=physical, perturb=perturb,
         reference=reference_rows, disturbance=disturbance_rows, measured_disturbance=measured_disturbance,
         shapes=Shapes(Reference, Flow, Physical), noise_limit=CLIP, isolation_reward=reward,
+        acting=Acting(flight_cost=flight_cost, lost=100.0, probes=PROBES, accommodate=accommodate),
     )  # fmt: skip

@@ -31,6 +31,9 @@ balances with opposite signs.
 A PI controller for each pump follows the commanded level. Mismatch multiplies each outflow coefficient by
 1 + level * U(-1, 1). The flight ends where a tank overflows, above 0.62 m.
 
+A diagnosis can act: pulses of a pump and of the commanded levels as probes; a weak pump is asked for more, what leaks out of
+tank 1 or 2 is fed forward.
+
 Processes: "standard" (one permanent fault in four flights of five, abrupt or incipient), "hard" (two passing faults of the
 lower half of the severities, some intermittent with a period of 30 to 60 s; mismatch 0.02, a livelier drain), "fault-free".
 Commanded levels change every 200 s.
@@ -51,6 +54,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
+from fdi_gym.acting import Acting, Probe, square
 from fdi_gym.drawing import uniform
 from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Incipient, Intermittent, Scoring, Seed
 from fdi_gym.kernels import kernel
@@ -128,11 +132,11 @@ def known(t, r, c, out):
 def control(t, y, r, q, c, u):
     """PI with conditional anti-windup: u = clip(u0 + kp e + c), e = r - y; c grows by ki dt e where nothing was clipped.
 
-    q = the trim command u0 (2).
+    q = the flow fed forward u0 (2), what a pump is asked for per flow that is wanted (2).
     """
     for i in range(2):
         e = r[i] - y[i]
-        wanted = q[i] + KP * e + c[i]
+        wanted = (q[i] + KP * e + c[i]) * q[2 + i]
         u[i] = min(max(wanted, 0.0), U_MAX)
         if u[i] == wanted:
             c[i] += KI * DT * e
@@ -275,6 +279,26 @@ def _mode(i: int, mode: str) -> FaultMode:
     )  # fmt: skip
 
 
+def flight_cost(x: np.ndarray, u: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Errors of the levels of tanks 1 and 2 over 3 cm, and a tenth of the pumps' moves over 2e-5 m^3/s, squared."""
+    error, effort = (x[..., :2] - r) / 0.03, (u - U_TRIM) / 2e-5
+    return (error**2).sum(axis=-1) + 0.1 * (effort**2).sum(axis=-1)
+
+
+def accommodate(theta: np.ndarray) -> np.ndarray:
+    """q (n, 4) for estimated theta (n, 7): leaks of tanks 1 and 2 fed forward at trim, weak pumps asked for more."""
+    leak = flow.py_func(np.maximum(theta[:, :2], 0.0), X_TRIM[:2])
+    return np.concatenate([U_TRIM + leak, 1.0 / np.clip(theta[:, 3:5], 0.2, 1.0)], axis=1)
+
+
+PROBES = (
+    Probe("pump 1", "the flow of pump 1 by 1.5e-5 m^3/s, up and down for 20 s each", command=square(40, (1.5e-5, 0.0))),
+    Probe("pump 2", "the flow of pump 2 by 1.5e-5 m^3/s, up and down for 20 s each", command=square(40, (0.0, 1.5e-5))),
+    Probe("levels", "the commanded levels by 3 cm, one up and the other down, for 40 s each",
+          reference=square(80, (0.03, -0.03))),
+)  # fmt: skip
+
+
 def plant() -> Plant:
     """Build the plant."""
     return Plant(
@@ -295,6 +319,7 @@ def plant() -> Plant:
             FaultProcess(name="hard", description="two slight passing faults, plant off the model by 2 %", sample=hard,
                          scoring=Scoring(grace=20, decision="second_half")),
         ],
-        c0=np.zeros(2), q=U_TRIM, physical=physical, perturb=perturb,
+        c0=np.zeros(2), q=np.concatenate([U_TRIM, np.ones(2)]), physical=physical, perturb=perturb,
         reference=reference_rows, disturbance=drain_rows, shapes=Shapes(Reference, Drain, Physical),
+        acting=Acting(flight_cost=flight_cost, lost=50.0, probes=PROBES, accommodate=accommodate),
     )  # fmt: skip

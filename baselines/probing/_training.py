@@ -1,0 +1,146 @@
+"""Train a probing policy with PPO (stable-baselines3) in the active environment, a diagnoser on board.
+
+    python -m baselines.probing._training B747Lateral quiet bayes_bank --discount 0.97 --decisions 150000
+
+The environment's action is the label that the diagnoser gives and the probe that the policy chooses. A probe costs now and
+tells later: with a discount of 0 the policy learns never to probe, and the belief that a probe leaves behind is worth
+something only to one that looks ahead.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box, Discrete
+from gymnasium.vector import AutoresetMode
+from stable_baselines3 import PPO
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import VecEnv
+
+import fdi_gym  # noqa: F401 (registers the environments)
+from baselines.learned._reinforcement import actor_tensors
+from baselines.probing.ppo import features, weights_of
+from fdi_gym.diagnosis import Diagnosis, make_diagnoser
+from fdi_gym.diagnosis.contract import choose
+from fdi_gym.plant import Array
+
+TRAINING = 3_500_000  # first seed
+
+
+class BeliefEnv(VecEnv):
+    """Active environments with a diagnoser on board, as the policy sees them.
+
+    Args:
+        plant_id: The plant.
+        process: Its fault process.
+        diagnoser: Name of the diagnoser.
+        n: Environments.
+        period: Decision period.
+        cost_weight: Factor on the price of a probe.
+    """
+
+    def __init__(self, plant_id: str, process: str, diagnoser: str, n: int, period: int, cost_weight: float):
+        self.envs: Any = gym.make_vec(
+            f"{plant_id}-Active-v0", num_envs=n, process=process, decision_period=period, cost_weight=cost_weight,
+            autoreset_mode=AutoresetMode.SAME_STEP,
+        )  # fmt: skip
+        self.plant = self.envs.unwrapped.plant
+        self.on_board = make_diagnoser(diagnoser, self.plant, process=process)
+        width = len(self.plant.labels) + len(self.plant.acting.probes) + len(self.plant.observed)
+        super().__init__(n, Box(-np.inf, np.inf, (width,), np.float32), Discrete(len(self.plant.acting.probes)))
+
+    def _see(self, block: Array) -> Array:
+        for k in range(block.shape[1]):
+            self.seen, self.said = self.on_board.update(self.seen, block[:, k])
+        return features(self.plant, block[:, -1], self.said, self.last).astype(np.float32)
+
+    def reset(self) -> Array:
+        """Begin new flights."""
+        obs, _ = self.envs.reset(seed=TRAINING)
+        self.last, self.seen = np.zeros(self.num_envs, np.int64), self.on_board.init(self.num_envs)
+        return self._see(obs[:, -1:])
+
+    def step_async(self, actions: Array) -> None:
+        """Keep the probes."""
+        self.last = np.asarray(actions, np.int64)
+
+    def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:  # type: ignore[override]
+        """Fly on; flights that end begin anew."""
+        label = np.clip(self.said.label, 0, len(self.plant.labels) - 1)
+        obs, reward, terminated, truncated, infos = self.envs.step(np.stack([label, self.last], axis=1))
+        done = terminated | truncated
+        block, unpacked = obs, [{} for _ in range(self.num_envs)]
+        if done.any():
+            block = obs.copy()
+            block[done] = np.stack(list(infos["final_obs"][done]))
+        shown = self._see(block)
+        for i in np.flatnonzero(done):
+            unpacked[i] = {"terminal_observation": shown[i], "TimeLimit.truncated": bool(truncated[i])}
+        if done.any():
+            begun, said = self.on_board.update(self.on_board.init(self.num_envs), obs[:, -1])
+            self.seen = choose(done, begun, self.seen)
+            self.said = Diagnosis(*(choose(done, a, b) if a is not None else None
+                                    for a, b in zip(said[:5], self.said[:5], strict=True)))  # fmt: skip
+            self.last = np.where(done, 0, self.last)
+            shown = np.where(done[:, None], features(self.plant, obs[:, -1], self.said, self.last), shown).astype(np.float32)
+        return shown, reward.astype(np.float32), done, unpacked
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.envs.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """One value for all."""
+        return [getattr(self.envs, attr_name, None)] * self.num_envs
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Not needed."""
+        raise NotImplementedError
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        """Not needed."""
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """No wrapper."""
+        return [False] * self.num_envs
+
+
+def main() -> None:
+    """Train and store."""
+    from safetensors.numpy import save_file
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name in ("plant", "process", "diagnoser"):
+        parser.add_argument(name)
+    parser.add_argument("--period", type=int, default=10)
+    parser.add_argument("--decisions", type=int, default=150_000)
+    parser.add_argument("--discount", type=float, default=0.97)
+    parser.add_argument("--cost-weight", type=float, default=1.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--variant", default="")
+    a = parser.parse_args()
+    env = BeliefEnv(a.plant, a.process, a.diagnoser, 32, a.period, a.cost_weight)
+    agent = PPO("MlpPolicy", env, learning_rate=1e-3, n_steps=64, batch_size=512, n_epochs=6, gamma=a.discount,
+    gae_lambda=0.9,
+                ent_coef=0.005, seed=a.seed, device="cpu", policy_kwargs={"net_arch": [64, 64]})  # fmt: skip
+    agent.set_logger(Logger(folder=None, output_formats=[]))
+    begun, done = time.monotonic(), 0
+    while done < a.decisions:
+        agent.learn(32 * 64 * 4, reset_num_timesteps=False)
+        done = agent.num_timesteps
+        probed = (np.asarray(agent.rollout_buffer.actions) > 0).mean()
+        reward = agent.rollout_buffer.rewards.mean()
+        print(f"{done} decisions, reward {reward:.3f}, probed {probed:.2f}, {time.monotonic() - begun:.0f} s", flush=True)
+    path = weights_of(a.plant, a.process, a.variant)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_file(actor_tensors(agent.policy.state_dict()), path)
+    print(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""A learned prober (PPO): what a diagnoser believes and the newest observation in, a probe out. Runs on NumPy.
+
+`python -m baselines.probing._training` makes the weights.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from baselines.learned.policy import actor
+from baselines.learned.weights import read_tensors
+from fdi_gym.agents import Prober
+from fdi_gym.diagnosis.contract import Diagnosis
+from fdi_gym.plant import Array, NotApplicableError, Plant
+
+FOLDER = Path(__file__).parent / "weights"
+
+
+def prober(plant: Plant, *, process: str = "standard", variant: str = "") -> Prober:
+    """The policy's likeliest probe.
+
+    Args:
+        plant: The plant.
+        process: The fault process that it was trained for.
+        variant: Of the training, as in the name of the file; "" for the one that is meant to be used.
+
+    Raises:
+        NotApplicableError: There are no weights.
+        RefusedError: The file holds none.
+    """
+    path = weights_of(plant.id, process, variant)
+    if not path.is_file():
+        raise NotApplicableError(f"no probing policy {variant!r} was trained for {plant.id} and its process {process!r}")
+    layers = {name: value.astype(float) for name, value in read_tensors(path).items()}
+
+    def choose(last: Array, obs: Array, said: Diagnosis) -> tuple[Array, Array]:
+        probe = actor(layers, features(plant, obs, said, last)).argmax(axis=1)
+        return probe, probe
+
+    return Prober(lambda n: np.zeros(n, np.int64), choose)
+
+
+def weights_of(plant_id: str, process: str, variant: str) -> Path:
+    """The file of a policy."""
+    return FOLDER / f"{'-'.join(part for part in ('ppo', plant_id, process, variant) if part)}.safetensors"
+
+
+def features(plant: Plant, obs: Array, said: Diagnosis, last: Array) -> Array:
+    """What the policy sees (n, labels + probes + n_obs): the belief, the last probe, the newest observation scaled."""
+    assert plant.acting is not None
+    labels = len(plant.labels)
+    belief: Any = np.eye(labels)[np.clip(said.label, 0, labels - 1)] if said.label_probs is None else said.label_probs
+    nominal, scale = (np.array([getattr(s, name) for s in plant.observed]) for name in ("nominal", "scale"))
+    seen = np.clip(np.nan_to_num((obs - nominal) / scale), -5.0, 5.0)
+    return np.concatenate([np.nan_to_num(belief), np.eye(len(plant.acting.probes))[last], seen], axis=1)

@@ -1,0 +1,1 @@
+"""Diagnoses that act: what probing and accommodation are worth. `python -m benchmarks.acting`."""
