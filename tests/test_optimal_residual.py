@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import scipy.linalg
-from conftest import states
+from conftest import build, states
 from test_general_filters import belief_of
 from test_parity_space import commands, flown
 
 from baselines.filters.optimal_residual import residual_filter, steady
-from fdi_gym.diagnosis import make_diagnoser
+from fdi_gym.diagnosis import NotApplicableError, make_diagnoser
 from fdi_gym.estimation.augmented import augmented
 from fdi_gym.estimation.linear import linear_model
 
@@ -77,6 +77,11 @@ def test_steady_without_gaps_and_again_after_one(b747):
     assert np.allclose(Y[39], Y[10], rtol=1e-6)
     assert np.trace(Y[49]) > 1.5 * np.trace(Y[39])
     assert np.abs(Y[120] - Y[39]).max() < 2e-3 * np.abs(Y[39]).max()
+
+
+def test_signatures_that_cost_too_much_are_declined():
+    with pytest.raises(NotApplicableError, match="31 evaluations of the model of CMGSatellite a sample, 3100 a second"):
+        make_diagnoser("optimal_residual", build("CMGSatellite"))
 
 
 def test_bad_settings(b747):

@@ -36,6 +36,8 @@ from fdi_gym.estimation.labels import manifolds
 from fdi_gym.estimation.signatures import Sums, heard, local, nothing_said, spoken_for
 from fdi_gym.plant import Array, Plant
 
+MOST = 2500.0  # evaluations of the model in a second of flight, from which the signatures of the faults follow
+
 
 class Steady(NamedTuple):
     """The plant at trim and the solution of its equation; N states and disturbances, m sensors."""
@@ -137,9 +139,16 @@ def optimal_residual(
         paces: Samples within which each of the sums of evidence forgets, 1 or more.
 
     Raises:
-        NotApplicableError: There is no steady observer at trim.
+        NotApplicableError: There is no steady observer at trim, or following the signatures costs too much.
         ValueError: A number out of range.
     """
     if not paces or min(paces) < 1:
         raise ValueError(f"paces of at least 1 sample are allowed, not {tuple(paces)}")
+    points = 1 + 2 * (len(plant.states) + len(belief.disturbances) + len(belief.z_size))
+    rate = points / plant.dt
+    if rate > MOST:
+        raise NotApplicableError(
+            f"its signatures cost too much: {points} evaluations of the model of {plant.id} a sample, {rate:.0f} a second of "
+            f"flight, where {MOST:.0f} are allowed"
+        )
     return diagnoser_of(plant, residual_filter(plant, belief, paces), by_labels(plant, calibration))
