@@ -148,7 +148,7 @@ def optimal_residual(
     rate = points / plant.dt
     if rate > MOST:
         raise NotApplicableError(
-            f"its signatures cost too much: {points} evaluations of the model of {plant.id} a sample, {rate:.0f} a second of "
-            f"flight, where {MOST:.0f} are allowed"
+            f"its signatures cost too much: {points} evaluations of the model of {plant.id} a sample, {rate:.0f} a second "
+            f"of flight, where {MOST:.0f} are allowed"
         )
     return diagnoser_of(plant, residual_filter(plant, belief, paces), by_labels(plant, calibration))
