@@ -68,6 +68,16 @@ def amortised(envs, samples):
     return [1e-6 * samples * envs.num_envs / seconds for seconds in clock.read()]
 
 
+def probed(envs, steps):
+    """M samples per CPU second of a vector environment, ten an action; actions are drawn, probes with them."""
+    envs.action_space.seed(0)
+    drawn = [envs.action_space.sample() for _ in range(16)]
+    clock = Clock()
+    for k in range(steps):
+        envs.step(drawn[k % 16])
+    return 1e-6 * 10 * steps * envs.num_envs / clock.read()[0]
+
+
 def stalls(envs, steps):
     """Milliseconds of CPU of a step: the median, the longest, and the longest of those about the ends of flights."""
     actions, spent, begins = np.zeros(envs.num_envs, int), [], []
@@ -194,6 +204,15 @@ def main():
     most.reset(seed=0)
     cpu, wall = interleaved({"": lambda: amortised(most, 1200)}, 1)[""]
     print(f"  {'B747Lateral at 8,192':30s} {cpu:7.2f} {wall:7.2f}")
+
+    print(f"{'1,024 at once, ten samples an action, M samples/s of CPU':56s} {'passive':>8s} {'active':>7s} {'ratio':>6s}")
+    for plant in (p for p in plants if load_plant(p).acting is not None):
+        pair = {kind: gym.make_vec(f"{plant}-{kind}-v0", num_envs=1024, decision_period=10) for kind in ("Faults", "Active")}
+        for envs in pair.values():
+            envs.reset(seed=0)
+        pace = interleaved({kind: lambda e=envs: probed(e, 60) for kind, envs in pair.items()}, arguments.repeats)
+        passive, active = pace["Faults"][0], pace["Active"][0]
+        print(f"  {plant:54s} {passive:8.2f} {active:7.2f} {active / passive:6.2f}")
 
     for plant in plants:
         wall, cpu, _, _ = fresh(FIRST_STEP.format(plant=plant, n=8192, more=0))

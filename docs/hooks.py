@@ -37,9 +37,9 @@ BOARDS = ROOT / "leaderboards"
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)")
 FLIGHTS = 10  # of a report
 REFERENCE = {
-    "Environments": ("envs", "vector_envs", "tasks", "wrappers", "sb3"),
-    "Plants": ("plant", "data_sheet", "faults", "shapes", "kernels", "discovery"),
-    "Flights": ("engine", "flights", "model"),
+    "Environments": ("envs", "vector_envs", "active_envs", "tasks", "wrappers", "sb3"),
+    "Plants": ("plant", "data_sheet", "acting", "faults", "shapes", "kernels", "discovery"),
+    "Flights": ("engine", "flights", "acts", "agents", "model"),
     "Diagnosers": ("diagnosis.contract", "diagnosis.filtering", "diagnosis.registry", "diagnosis.making",
                    "diagnosis.fitting", "diagnosis.guard"),
     "Estimation": ("estimation.belief", "estimation.calibration", "estimation.decision", "estimation.augmented",
@@ -58,6 +58,7 @@ def on_config(config: Any) -> Any:
         "@plants": ["plants/index.md", *({name: f"plants/{name}.md"} for name in plant_sources())],
         "@boards": ["boards/README.md", {"Grid of methods and plants": "boards/grid.md"},
                     {"Learned": "boards/learning/README.md"}, {"Coverage of the intervals": "boards/coverage.md"},
+                    {"Acting": "boards/acting.md"},
                     *({path.stem: f"boards/{path.name}"} for path in sorted(BOARDS.glob("*-*.md")))],
         "@reproduction": ["reproduction.md", *({path.stem: f"boards/reproduction/{path.name}"} for path in _reproduction())],
         "@reference": [{title: f"reference/{_slug(title)}.md"} for title in REFERENCE],

@@ -116,15 +116,13 @@ class Acts:
 def costs(flights: Flights, chunk: Chunk, k: Array) -> Array:
     """What the samples (m, N) of a chunk cost, which begins at the samples k (N,); 0 after the end of a flight."""
     plant, m = flights.plant, len(chunk.label)
-    rows = np.empty((m, len(flights), plant.reference_width))
-    for i, first in enumerate(k.tolist()):
-        reference = flights.tables[i][0]
-        if len(reference) == 1:
-            rows[:, i] = reference
+    rows = np.empty((len(flights), m, plant.reference_width))
+    for mine, (reference, *_), first in zip(rows, flights.tables, k.tolist(), strict=True):
+        if len(reference) == 1 or first + m <= len(reference):
+            mine[:] = reference if len(reference) == 1 else reference[first : first + m]
         else:
-            found = reference[first : first + m]
-            rows[: len(found), i], rows[len(found) :, i] = found, reference[-1]
-    cost = acting_of(plant).cost(chunk.state, plant.split(chunk.obs)[1], rows)
+            mine[:] = reference[np.minimum(np.arange(first, first + m), len(reference) - 1)]
+    cost = acting_of(plant).cost(chunk.state, plant.split(chunk.obs)[1], rows.swapaxes(0, 1))
     return np.where(k + np.arange(m)[:, None] <= flights.length, cost, 0.0)
 
 

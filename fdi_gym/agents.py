@@ -118,5 +118,6 @@ def _decisions(said: list[Diagnosis]) -> Decisions:
         return np.stack([np.full_like(have, np.nan) if v is None else v for v in values], axis=1)
 
     alarm, label = (np.stack([getattr(d, name) for d in said], axis=1) for name in ("alarm", "label"))
-    wide = {name: rows(name) for name in ("estimate", "estimate_std", "label_probs", "state")}
-    return Decisions(alarm, label.astype(np.int16), **wide)
+    return Decisions(
+        alarm, label.astype(np.int16), rows("estimate"), rows("estimate_std"), rows("label_probs"), rows("state")
+    )

@@ -49,13 +49,21 @@ def as_plant(text: str) -> str | None:
     module, _, name = text.rpartition(":")
     if module:
         find_module(module)
-    ids = {f"{plant}-Faults-v{source.version}": plant for plant, source in plant_sources().items()}
-    return name if name in ids.values() else ids.get(name)
+    return _ids().get(name)
+
+
+def _ids() -> dict[str, str]:
+    """The plants by their own ids and those of their environments."""
+    found = {plant: plant for plant in plant_sources()}
+    for plant, source in plant_sources().items():
+        found |= {f"{plant}-{kind}-v{source.version}": plant for kind in ("Faults", "Active")}
+    return found
 
 
 def overview() -> str:
     """Names of all environments, suites, diagnosers and trainers, with a line for each; what is broken is listed as such."""
-    lines = ["Environments", *(f"  {name}-Faults-v{source.version}" for name, source in plant_sources().items())]
+    lines = ["Environments (those called -Active- are of plants that declare how they can be acted on)"]
+    lines += [f"  {name}-{{Faults,Active}}-v{source.version}" for name, source in plant_sources().items()]
     lines += ["", "Suites", *(f"  {name:32s} {_said(lambda n=name: load_suite(n).description)}" for name in suite_names())]
     marked = {name: "*" if GROUPS["reference"](entry) else "" for name, entry in diagnosers().items()}
     lines += ["", 'Diagnosers (*: in the group "reference"; "all" is the group of all)']
@@ -80,7 +88,7 @@ def details(text: str) -> str:
         ValueError: Nothing is called so.
     """
     name = text.rpartition(":")[2]
-    ids = {*plant_sources(), *(f"{plant}-Faults-v{source.version}" for plant, source in plant_sources().items())}
+    ids = _ids()
     found = []
     if text in ids:
         found.append(load_plant(find_plant(text)[1]).describe())
@@ -102,7 +110,7 @@ def details(text: str) -> str:
 def _outside(text: str, name: str) -> str:
     """What "module:name" names: a plant that the module registers, or else a trainer or a builder in it."""
     function = getattr(find_module(text.rpartition(":")[0]), name, None)
-    if name in plant_sources() or name in {f"{p}-Faults-v{s.version}" for p, s in plant_sources().items()}:
+    if name in _ids():
         return load_plant(find_plant(text)[1]).describe()
     if any(entry.build is function for entry in trainers().values()):
         return _trainer(find_trainer(text))

@@ -279,6 +279,9 @@ class Plant(Truth):
         lines += [f"  {i:2d} {label.name}" for i, label in enumerate(self.labels)]
         lines.append("\nfault modes")
         lines += [f"  {mode.name:20s} {mode.description}" for mode in self.modes]
+        if self.acting is not None:
+            lines.append("\nprobes (action of the active environment)")
+            lines += [f"  {i:2d} {probe.name:17s} {probe.description}" for i, probe in enumerate(self.acting.probes)]
         lines.append("\nscenarios")
         lines += [f"  {name:20s} {process.description}" for name, process in self.processes.items()]
         return "\n".join(lines)

@@ -474,3 +474,45 @@ def test_registering_a_plant_registers_its_active_environment():
         assert f"{plant_id}-Active-v{source.version}" in gym.registry
     assert fdi_gym.__version__
     assert isinstance(load_plant("ThreeTank").acting, Acting)
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# The page
+
+
+def test_the_page_is_what_the_figures_say():
+    from benchmarks.acting import page
+    from benchmarks.acting.__main__ import BOARDS, measured
+    from benchmarks.acting.suites import ACCOMMODATION, ACTIVE
+
+    found = measured()
+    assert set(found) == {*ACTIVE, *ACCOMMODATION, "bounds"}
+    assert (BOARDS / "acting.md").read_text() == page.page(found, "leaderboards/acting")
+    for name in ACTIVE:
+        assert all((BOARDS / "pictures" / f"{name}{suffix}.png").is_file() for suffix in ("", "-flight"))
+
+
+def test_what_is_called_more_than_chance_is():
+    from benchmarks.acting import page
+    from benchmarks.acting.__main__ import measured
+
+    row = {"agent": "greedy", "prober": "greedy", "per_sample": [0.9, 0.8, 1.0], "cost": [0.1, 0.0, 0.2]}
+    for gain, late, words in (([0.1, 0.05, 0.15], [-2.0, -3.0, -1.0], "(more than chance)"),
+                              ([0.1, -0.05, 0.25], [-2.0, -5.0, 1.0], "no more than chance")):  # fmt: skip
+        said = page.verdict({"passive": "never", "rows": [row | {"per_sample_gain": gain, "delay_gain": late}]})
+        assert said.count(words) == 2
+    assert measured()
+
+
+@pytest.mark.parametrize("variant", ["", "discount-0", "recurrent"])
+def test_a_learned_prober_chooses_probes_and_one_that_does_not_look_ahead_never_pays(variant):
+    from baselines.probing import ppo, recurrent_ppo
+
+    plant = load_plant("B747Lateral")
+    built = recurrent_ppo.prober(plant, process="quiet") if variant == "recurrent" else \
+        ppo.prober(plant, process="quiet", variant=variant)  # fmt: skip
+    bank = make_diagnoser("bayes_bank", plant, process="quiet")
+    found = fly(plant, scenarios(plant, 4, "quiet", steps=400), bank, built)
+    assert found.probe.any() == (variant != "discount-0")
+    with pytest.raises(ValueError, match="trained"):
+        ppo.prober(plant, process="gust")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -24,7 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv
 import fdi_gym  # noqa: F401 (registers the environments)
 from baselines.learned._reinforcement import actor_tensors
 from baselines.probing.ppo import features, weights_of
-from fdi_gym.diagnosis import Diagnosis, make_diagnoser
+from fdi_gym.diagnosis import make_diagnoser
 from fdi_gym.diagnosis.contract import choose
 from fdi_gym.plant import Array
 
@@ -83,8 +84,7 @@ class BeliefEnv(VecEnv):
         if done.any():
             begun, said = self.on_board.update(self.on_board.init(self.num_envs), obs[:, -1])
             self.seen = choose(done, begun, self.seen)
-            self.said = Diagnosis(*(choose(done, a, b) if a is not None else None
-                                    for a, b in zip(said[:5], self.said[:5], strict=True)))  # fmt: skip
+            self.said = choose(done, said._replace(signals=None), self.said._replace(signals=None))
             self.last = np.where(done, 0, self.last)
             shown = np.where(done[:, None], features(self.plant, obs[:, -1], self.said, self.last), shown).astype(np.float32)
         return shown, reward.astype(np.float32), done, unpacked
@@ -110,6 +110,21 @@ class BeliefEnv(VecEnv):
         return [False] * self.num_envs
 
 
+def lstm_tensors(state: Mapping[str, Any]) -> dict[str, Array]:
+    """The actor's LSTM out of the state of an sb3-contrib `MlpLstmPolicy`."""
+    w = {name: state[f"lstm_actor.{name}_l0"].cpu().numpy() for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")}
+    return {"lstm.weight_ih": w["weight_ih"], "lstm.weight_hh": w["weight_hh"], "lstm.bias": w["bias_ih"] + w["bias_hh"]}
+
+
+def algorithm(recurrent: bool) -> type[Any]:
+    """PPO, or that of sb3-contrib with an LSTM."""
+    if recurrent:
+        from sb3_contrib import RecurrentPPO
+
+        return RecurrentPPO
+    return PPO
+
+
 def main() -> None:
     """Train and store."""
     from safetensors.numpy import save_file
@@ -123,11 +138,14 @@ def main() -> None:
     parser.add_argument("--cost-weight", type=float, default=1.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--variant", default="")
+    parser.add_argument("--recurrent", action="store_true", help="with an LSTM (sb3-contrib)")
     a = parser.parse_args()
     env = BeliefEnv(a.plant, a.process, a.diagnoser, 32, a.period, a.cost_weight)
-    agent = PPO("MlpPolicy", env, learning_rate=1e-3, n_steps=64, batch_size=512, n_epochs=6, gamma=a.discount,
-    gae_lambda=0.9,
-                ent_coef=0.005, seed=a.seed, device="cpu", policy_kwargs={"net_arch": [64, 64]})  # fmt: skip
+    shape: dict[str, Any] = {"net_arch": [64, 64], **({"lstm_hidden_size": 64} if a.recurrent else {})}
+    agent = algorithm(a.recurrent)(
+        "MlpLstmPolicy" if a.recurrent else "MlpPolicy", env, learning_rate=1e-3, n_steps=64, batch_size=512, n_epochs=6,
+        gamma=a.discount, gae_lambda=0.9, ent_coef=0.005, seed=a.seed, device="cpu", policy_kwargs=shape,
+    )  # fmt: skip
     agent.set_logger(Logger(folder=None, output_formats=[]))
     begun, done = time.monotonic(), 0
     while done < a.decisions:
@@ -136,9 +154,10 @@ def main() -> None:
         probed = (np.asarray(agent.rollout_buffer.actions) > 0).mean()
         reward = agent.rollout_buffer.rewards.mean()
         print(f"{done} decisions, reward {reward:.3f}, probed {probed:.2f}, {time.monotonic() - begun:.0f} s", flush=True)
-    path = weights_of(a.plant, a.process, a.variant)
+    path = weights_of(a.plant, a.process, "recurrent" if a.recurrent else a.variant)
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_file(actor_tensors(agent.policy.state_dict()), path)
+    state = agent.policy.state_dict()
+    save_file({**actor_tensors(state), **(lstm_tensors(state) if a.recurrent else {})}, path)
     print(path)
 
 

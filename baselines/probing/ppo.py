@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,11 @@ def prober(plant: Plant, *, process: str = "standard", variant: str = "") -> Pro
 def weights_of(plant_id: str, process: str, variant: str) -> Path:
     """The file of a policy."""
     return FOLDER / f"{'-'.join(part for part in ('ppo', plant_id, process, variant) if part)}.safetensors"
+
+
+def layer_names(tensors: Mapping[str, Array]) -> list[str]:
+    """The layers of a stored policy, first to last."""
+    return sorted({name.rpartition(".")[0] for name in tensors if name.startswith("layers.")})
 
 
 def features(plant: Plant, obs: Array, said: Diagnosis, last: Array) -> Array:

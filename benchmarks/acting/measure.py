@@ -49,8 +49,9 @@ def delays(outcomes: list[Outcome], horizon: float, dt: float) -> Array:
     return np.array(found)
 
 
-def probing(suite: Suite, diagnoser: str) -> dict[str, Any]:
-    """Every agent on a suite's flights: accuracy, delay and cost, and the differences to never probing."""
+def probing(suite: Suite) -> dict[str, Any]:
+    """Every agent on a suite's flights: accuracy, delay and cost, and the differences to the best that never probes."""
+    diagnoser = suite.diagnosers[0]
     plant = suite.plant()
     scenarios = suite.scenarios(plant)
     on_board = make_diagnoser(diagnoser, plant, process=suite.process)
@@ -67,11 +68,17 @@ def probing(suite: Suite, diagnoser: str) -> dict[str, Any]:
             outcomes = [outcome(plant, scoring, flown.record, flown.decisions, i) for i in range(len(scenarios))]
             found[label_of(name, settings)] = name, flown, outcomes
             print(f"  {label_of(name, settings)}: {time.monotonic() - begun:.0f} s", flush=True)
+    for other in suite.diagnosers[1:]:
+        flown = fly(plant, scenarios, make_diagnoser(other, plant, process=suite.process), period=suite.period)
+        outcomes = [outcome(plant, scoring, flown.record, flown.decisions, i) for i in range(len(scenarios))]
+        found[f"never, {other} on board"] = "never", flown, outcomes
     drawn = {kind: draw_again({k: v[2] for k, v in found.items()}, len(plant.labels), kind)
              for kind in ("per_sample", "per_decision")}  # fmt: skip
     onsets = [o.onsets[0].length for o in found["never"][2] if o.onsets]
     horizon = float(np.median(onsets)) * plant.dt
-    passive = found["never"]
+    quiet = [key for key, (name, *_) in found.items() if name == "never"]
+    best = max(quiet, key=lambda key: drawn["per_sample"].score[drawn["per_sample"].names.index(key)])
+    passive = found[best]
     rows = []
     for key, (name, flown, outcomes) in found.items():
         scores = summarise(outcomes, len(plant.labels), entries, plant.dt)
@@ -80,16 +87,16 @@ def probing(suite: Suite, diagnoser: str) -> dict[str, Any]:
         rows.append({
             "agent": key, "prober": name,
             **{kind: [scores[kind]["balanced_accuracy"], *scores[kind]["balanced_accuracy_interval"]] for kind in drawn},
-            **{f"{kind}_gain": list(drawn[kind].difference(key, "never")) for kind in drawn},
+            **{f"{kind}_gain": list(drawn[kind].difference(key, best)) for kind in drawn},
             "delay": float(np.nanmean(late)), "delay_gain": mean_interval(gap) if gap.size > 1 else None,
             "false_alarms_per_hour": scores["detection"]["false_alarms_per_hour"],
             "cost": mean_interval(flown.cost[:, 1:].mean(axis=1) - passive[1].cost[:, 1:].mean(axis=1)),
             "probed": float((flown.probe[:, 1:] > 0).mean()),
             "lost": int(flown.record.terminated.sum()),
         })  # fmt: skip
-    pictured = {key: found[key] for key in ("never", label_of("greedy", PROBERS["greedy"][2]))}
+    pictured = {key: found[key] for key in ("never", label_of("greedy", PROBERS["greedy"][1]))}
     return {
-        "suite": suite._asdict(), "diagnoser": diagnoser, "horizon": horizon,
+        "suite": suite._asdict(), "diagnoser": diagnoser, "passive": best, "horizon": horizon,
         "prices": dict(zip([p.name for p in plant.acting.probes], probe_prices(plant), strict=True)),  # type: ignore[union-attr]
         "rows": rows, "flight": _flight(plant, pictured),
     }  # fmt: skip

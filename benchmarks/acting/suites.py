@@ -19,7 +19,7 @@ class Suite(NamedTuple):
     process: str
     flights: int
     period: int  # samples of a decision
-    diagnosers: tuple[str, ...]  # with each all agents are flown
+    diagnosers: tuple[str, ...]  # on board: of an active suite the first one with all agents, the others with none
     why: str
 
     def plant(self) -> Plant:
@@ -32,15 +32,16 @@ class Suite(NamedTuple):
 
 
 ACTIVE = {
-    "b747-active": Suite("B747Lateral", {}, "quiet", 120, 10, ("bayes_bank",),
+    "b747-active": Suite("B747Lateral", {}, "quiet", 120, 10,
+                         ("bayes_bank", "two_stage_kf", "augmented_ekf", "multiple_model_ekf"),
                          "level flight, no excitation: a weak surface that is not moved is not seen"),
-    "huav-active": Suite("HUAVHover", {}, "quiet", 120, 25, ("hypothesis_bank",),
+    "huav-active": Suite("HUAVHover", {}, "quiet", 120, 25, ("hypothesis_bank", "augmented_ekf"),
                          "hover in still air: little moves but by the sensors' noise"),
-    "missile-active": Suite("MissilePitch", {}, "standard", 90, 50, ("augmented_ekf",),
+    "missile-active": Suite("MissilePitch", {}, "standard", 90, 50, ("augmented_ekf", "mode_pursuit_ekf"),
                             "the standard flights, whose commanded incidence is zero in a third of the time"),
-    "cmg-active": Suite("CMGSatellite", {"reference": "regulate"}, "standard", 64, 100, ("mekf",),
+    "cmg-active": Suite("CMGSatellite", {"reference": "regulate"}, "standard", 64, 100, ("mekf", "augmented_ekf"),
                         "at rest after the first 15 s: nothing turns, so no effectiveness is seen"),
-    "tank-active": Suite("ThreeTank", {}, "standard", 120, 10, ("mode_pursuit_ekf",),
+    "tank-active": Suite("ThreeTank", {}, "standard", 120, 10, ("mode_pursuit_ekf", "augmented_ekf"),
                          "the standard flights, whose commanded levels change every 200 s"),
 }  # fmt: skip
 
@@ -61,8 +62,9 @@ ACCOMMODATION = {
 # Agents that probe: name of the prober and its settings; a curve for each, from little to much
 PROBERS: dict[str, list[dict[str, Any]]] = {
     "never": [{}],
-    "periodic": [{"on": 2, "every": 20}, {"on": 6, "every": 20}, {"on": 20, "every": 20}],
-    "at_random": [{"share": 0.1, "hold": 2}, {"share": 0.3, "hold": 6}, {"share": 1.0, "hold": 20}],
-    "greedy": [{"cost_weight": 30.0}, {"cost_weight": 10.0}, {"cost_weight": 3.0}, {"cost_weight": 0.3}],
+    "periodic": [{"on": 2, "every": 20}, {"on": 6, "every": 20}],
+    "at_random": [{"share": 0.1, "hold": 2}, {"share": 0.3, "hold": 6}],
+    "greedy": [{"cost_weight": 10.0}, {"cost_weight": 3.0}, {"cost_weight": 0.3}],
     "ppo": [{}, {"variant": "discount-0"}],
+    "recurrent_ppo": [{}],
 }

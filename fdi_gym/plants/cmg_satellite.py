@@ -522,7 +522,7 @@ def flight_cost(x: np.ndarray, u: np.ndarray, r: np.ndarray) -> np.ndarray:
 PROBES = (
     Probe("null", "null motion of the gimbals, 0.05 n(d) at a period of 7 s, which puts no torque on a healthy satellite",
           parameters=np.array([0.0, NULL_AMPLITUDE, 0.0, 0.0, 0.0, 0.0])),
-    Probe("common", "all gimbals together by 0.02 rad/s, to and fro for 1 s each", command=square(200, [0.02] * 4)),
+    Probe("common", "all gimbals together by 0.004 rad/s, to and fro for 1 s each", command=square(200, [0.004] * 4)),
 )  # fmt: skip
 
 

@@ -1,0 +1,57 @@
+"""A learned prober with a memory (recurrent PPO of sb3-contrib): what `ppo` sees goes through an LSTM. Runs on NumPy.
+
+`python -m baselines.probing._training PLANT PROCESS DIAGNOSER --recurrent` makes the weights.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.special
+
+from baselines.learned.weights import read_tensors
+from baselines.probing.ppo import features, layer_names, weights_of
+from fdi_gym.agents import Prober
+from fdi_gym.diagnosis.contract import Diagnosis
+from fdi_gym.plant import Array, NotApplicableError, Plant
+
+
+class Memory(NamedTuple):
+    """The last probe (n,), and the LSTM's output and cell (n, width)."""
+
+    last: Array
+    h: Array
+    c: Array
+
+
+def prober(plant: Plant, *, process: str = "standard") -> Prober:
+    """The policy's likeliest probe.
+
+    Args:
+        plant: The plant.
+        process: The fault process that it was trained for.
+
+    Raises:
+        NotApplicableError: There are no weights.
+        RefusedError: The file holds none.
+    """
+    path = weights_of(plant.id, process, "recurrent")
+    if not path.is_file():
+        raise NotApplicableError(f"no recurrent probing policy was trained for {plant.id} and its process {process!r}")
+    w = {name: value.astype(float) for name, value in read_tensors(path).items()}
+    width = w["lstm.weight_hh"].shape[1]
+
+    def choose(s: Memory, obs: Array, said: Diagnosis) -> tuple[Memory, Array]:
+        x = features(plant, obs, said, s.last)
+        i, f, g, o = np.split(x @ w["lstm.weight_ih"].T + s.h @ w["lstm.weight_hh"].T + w["lstm.bias"], 4, axis=1)
+        c = scipy.special.expit(f) * s.c + scipy.special.expit(i) * np.tanh(g)
+        h = scipy.special.expit(o) * np.tanh(c)
+        y, layers = h, layer_names(w)
+        for number, layer in enumerate(layers):
+            y = y @ w[f"{layer}.weight"].T + w[f"{layer}.bias"]
+            y = np.tanh(y) if number < len(layers) - 1 else y
+        probe = y.argmax(axis=1)
+        return Memory(probe, h, c), probe
+
+    return Prober(lambda n: Memory(np.zeros(n, np.int64), np.zeros((n, width)), np.zeros((n, width))), choose)
