@@ -183,6 +183,7 @@ def page(cards: list[Card]) -> str:
 def main() -> None:
     """Write the page and the pictures."""
     cards = [weights.read_card(path) for path in sorted(weights.WEIGHTS.glob("*.safetensors"))]
+    cards = [card for card in cards if "accuracy" in card.curve[-1]]  # of what is trained round by round
     for card in cards:
         picture(card, HOME / "learning" / f"{card.method}-{card.plant}.png")
     write_whole(HOME / "learning" / "README.md", page(cards).encode())

@@ -15,6 +15,7 @@ COMMANDS: dict[str, Any] = {
     "evaluate": rows.evaluate, "verify": rows.verify,
     "leaderboard": pages.leaderboard, "report": pages.report, "plot": pages.plot,
     "list": suites.show, "freeze": suites.freeze, "fit": methods.fit, "train": methods.train,
+    "diagnosability": methods.diagnosability,
     "diagnose": recordings.diagnose, "collect": recordings.collect, "export": recordings.export,
     "seal": rounds.seal, "reveal": rounds.reveal,
     "new": packages.new, "check": packages.check,

@@ -20,6 +20,7 @@ from fdi_gym.diagnosis.fitting import flights_of
 from fdi_gym.engine import no_noise, simulate
 from fdi_gym.estimation import mixing
 from fdi_gym.estimation.linear import linear_model
+from fdi_gym.estimation.signatures import linearised, secants
 from fdi_gym.faults import draw
 
 FLIGHTS = 3
@@ -145,10 +146,10 @@ def test_signature_predicts_the_innovations_of_a_fault(b747):
 
 
 def test_secants_lie_on_the_side_of_the_modes():
-    low, high = glr.secants(build("CMGSatellite"), np.full(4, 0.5))
+    low, high = secants(build("CMGSatellite"), np.full(4, 0.5))
     assert np.array_equal(low, [-0.5] * 4)
     assert np.array_equal(high, [0.0] * 4)
-    low, high = glr.secants(build("MissilePitch"), np.ones(5))
+    low, high = secants(build("MissilePitch"), np.ones(5))
     assert np.array_equal(low, [-1, -1, 0, 0, 0])
     assert np.array_equal(high, np.ones(5))
 
@@ -162,7 +163,7 @@ def test_linearisation_equals_the_jacobian_where_the_model_is_linear_in_the_faul
     def f(points):
         return model.f(points, at)
 
-    found = glr.linearised(model, f, X, *glr.secants(b747, belief_of(b747).z_size), model.rest)
+    found = linearised(model, f, X, *secants(b747, belief_of(b747).z_size), model.rest)
     _, F = model.jacobian_f(np.concatenate([X, np.zeros((2, 4))], axis=1), at)
     assert np.allclose(found.A, F[:, :4, :4], atol=1e-9)
     assert np.allclose(found.E, F[:, :4, 4:], atol=1e-9)

@@ -105,6 +105,21 @@ def test_docstrings_and_comments_do_not_make_another_plant(tmp_path):
     assert digests[0] == digests[1] != digests[2]
 
 
+def test_fitting_some_methods_keeps_what_the_file_holds_of_others(tmp_path, b747):
+    """Of the same plant code; what was made from other code goes, and so does a damaged file."""
+    path = tmp_path / f"{b747.id}.json"
+    a, b, c = (Calibration(thresholds={b747.modes[0].name: value}) for value in (1.0, 2.0, 3.0))
+    found = Fits(plant=b747.id, code="now", calibrations={"mine": b})
+    assert knowledge.merged(path, found) == found
+    write_fits(path, Fits(plant=b747.id, code="now", calibrations={"mine": a, "theirs": c}))
+    together = knowledge.merged(path, found).calibrations
+    assert {name: digest(value) for name, value in together.items()} == {"mine": digest(b), "theirs": digest(c)}
+    write_fits(path, Fits(plant=b747.id, code="before", calibrations={"theirs": c}))
+    assert set(knowledge.merged(path, found).calibrations) == {"mine"}
+    path.write_bytes(b"{")
+    assert set(knowledge.merged(path, found).calibrations) == {"mine"}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("plant_id", SUITED)
 def test_fitting_again_gives_the_same_bytes(plant_id):

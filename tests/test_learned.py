@@ -43,7 +43,8 @@ TINY = SequenceRecipe(
     flights=16, identify=8, chunk=8, passes=2, validation=4, validate=1, batch=8, hidden=16,
 )  # fmt: skip
 COMMITTED = sorted(weights.WEIGHTS.glob("*.safetensors"))
-LEARNED = ("sequence_net", "residual_net", "ppo", "ppo_identification")
+LEARNED = ("sequence_net", "residual_net", "ppo", "ppo_identification")  # networks
+CLOSED_FORM = ("pca", "dynamic_pca", "cva", "boosted_trees", "random_forest", "minirocket")  # what learns without torch
 NETWORKS = [path for path in COMMITTED if "_net-" in path.stem]
 
 
@@ -253,7 +254,7 @@ def test_a_run_leaves_a_card_and_a_log(tiny):
 
 
 def test_every_learned_method_has_a_trainer_of_its_name():
-    assert set(LEARNED) == set(trainers())
+    assert {*LEARNED, *CLOSED_FORM} == set(trainers())
     with pytest.raises(ValueError, match=r"unknown trainer 'sequence_nett'; did you mean sequence_net\?"):
         find_trainer("sequence_nett")
     with pytest.raises(ValueError, match="two trainers are called 'ppo'"):
@@ -431,7 +432,7 @@ def test_without_weights_or_a_library_the_reason_is_given(monkeypatch, tmp_path)
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "torch", None)
     make_diagnoser("sequence_net", build("B747Lateral"))
-    for name in trainers():
+    for name in LEARNED:
         with pytest.raises(NotApplicableError, match=r"needs torch: pip install 'fdi-gym\[learn\]'"):
             train(name, build("B747Lateral"), work=tmp_path)
     monkeypatch.setitem(sys.modules, "safetensors", None)

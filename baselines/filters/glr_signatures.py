@@ -12,7 +12,6 @@ that a fault of typical size makes (a secant), so that a fault which acts like a
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +23,8 @@ from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_labels
 from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T, masked, right_divide, symmetric, times
-from fdi_gym.estimation.labels import manifolds, nearest_of
+from fdi_gym.estimation.labels import manifolds
+from fdi_gym.estimation.signatures import linearised, secants, spoken_for
 from fdi_gym.plant import Array, Plant
 
 
@@ -42,48 +42,6 @@ class Ratio(NamedTuple):
     faults: Array  # (n,) bool: an interval has ended in which a fault could have acted
 
 
-def secants(plant: Plant, size: Array) -> tuple[Array, Array]:
-    """The two magnitudes (p,) between which the signature of each entry is taken.
-
-    Between healthy and a typical fault where the modes on that entry have one sign; else symmetric about healthy.
-    """
-    up, down = np.zeros(len(size), bool), np.zeros(len(size), bool)
-    for mode in plant.modes:
-        ends = np.array(mode.offset)[:, None] + np.outer(mode.direction, mode.reach)
-        up |= (ends > 0).any(axis=1)
-        down |= (ends < 0).any(axis=1)
-    return np.where(down | ~up, -size, 0.0), np.where(up | ~down, size, 0.0)
-
-
-class Signatures(NamedTuple):
-    """How a function of the augmented model changes."""
-
-    mean: Array  # (n, m)
-    A: Array  # (n, m, N) with state and disturbance
-    E: Array  # (n, m, p) with a unit of each fault entry
-
-
-def linearised(
-    model: AugmentedModel, g: Callable[[Array], Array], X: Array, low: Array, high: Array, images: slice | list[int]
-) -> Signatures:
-    """A function g of the model at the healthy estimate X (n, N) of state and disturbance; `images`: entries that count."""
-    n, p, rest, zs = len(X), len(low), model.rest, model.z
-    N = len(rest)
-    points = np.zeros((n, 1 + 2 * N + 2 * p, len(model.scale)))
-    points[:, :, rest] = X[:, None]
-    step = model.compiled.step[rest]
-    for j, i in enumerate(rest):
-        points[:, 1 + j, i] += step[j]
-        points[:, 1 + N + j, i] -= step[j]
-    for j in range(p):
-        points[:, 1 + 2 * N + j, zs.start + j] = high[j]
-        points[:, 1 + 2 * N + p + j, zs.start + j] = low[j]
-    F = g(points)[..., images]
-    A = T((F[:, 1 : 1 + N] - F[:, 1 + N : 1 + 2 * N]) / (2 * step[:, None]))
-    E = T((F[:, 1 + 2 * N : 1 + 2 * N + p] - F[:, 1 + 2 * N + p :]) / (high - low)[:, None])
-    return Signatures(F[:, 0], A, E)
-
-
 def glr_filter(plant: Plant, model: AugmentedModel, size: Array, onsets: int, spacing: int) -> Filter:
     """The healthy filter with its signatures.
 
@@ -99,7 +57,6 @@ def glr_filter(plant: Plant, model: AugmentedModel, size: Array, onsets: int, sp
     N, Q = len(rest), model.Q[np.ix_(rest, rest)]
     fade = 1.0 - 1.0 / (onsets * spacing)
     sets, labels = manifolds(plant), len(plant.labels)
-    h = len(sets.labels)
 
     def start(n: int) -> Ratio:
         return Ratio(
@@ -142,14 +99,8 @@ def glr_filter(plant: Plant, model: AugmentedModel, size: Array, onsets: int, sp
         )  # fmt: skip
 
     def read(s: Ratio) -> Reading:
-        n, x = len(s.X), model.x
-        cost, z = np.zeros((n, labels)), np.zeros((n, labels, p))
-        value, magnitude = nearest_of(s.G.reshape(n * onsets, p, p), s.g.reshape(n * onsets, p), sets)
-        value, magnitude = value.reshape(n, onsets, h), magnitude.reshape(n, onsets, h, -1)
-        rows, columns, when = np.arange(n)[:, None], np.arange(h), np.argmin(value, axis=1)  # (n, h)
-        cost[:, sets.labels] = value[rows, when, columns]
-        z[:, sets.labels] = sets.points(magnitude[rows, when, columns])
-        chosen = z[np.arange(n), np.argmin(cost, axis=1)]
+        x = model.x
+        cost, chosen = spoken_for(s.G, s.g, sets, labels)
         return Reading(chosen, None, s.X[:, x], s.P[:, x, x], s.nu, s.S, s.seen, cost)
 
     return Filter(start, predict, update, read, expect=lambda s, at: model.expect(s.X[:, model.x], at))

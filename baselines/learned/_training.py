@@ -34,12 +34,6 @@ MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of Adam
 R = TypeVar("R", bound=Recipe)
 
 
-def command(method: str, plant: Plant, budget: int | None, seed: int) -> str:
-    """What to type to train the same weights again."""
-    parts = ["fdi-gym train", method, plant.id, f"--budget {budget}" if budget else "", f"--seed {seed}" if seed else ""]
-    return " ".join(part for part in parts if part)
-
-
 class Training(ABC, Generic[R]):
     """One training run in a folder: `run()` trains to the end, or goes on where a killed run was.
 

@@ -62,9 +62,8 @@ def train_ppo(
         ValueError: The folder holds another run.
     """
     from baselines.learned._reinforcement import PolicyTraining
-    from baselines.learned._training import command
 
     return PolicyTraining(
         method, plant, policy_recipe(plant, task, budget), seed=seed, work=work / f"{method}-{plant.id}-{seed}",
-        command=command(method, plant, budget, seed), threads=threads,
+        command=weights.command(method, plant, budget, seed), threads=threads,
     ).run()  # fmt: skip

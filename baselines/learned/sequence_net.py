@@ -109,14 +109,14 @@ def train_sequence_net(
         ValueError: There is no network to start from, or the folder holds another run.
     """
     from baselines.learned._supervised import SupervisedTraining
-    from baselines.learned._training import command
 
     recipe = (residual_recipe if method == "residual_net" else sequence_recipe)(plant, budget)
     file = f"sequence_net-{plant.id}.safetensors"
     own = work / f"sequence_net-{plant.id}-{seed}" / file
     return SupervisedTraining(
         method, plant, recipe, seed=seed, work=work / f"{method}-{plant.id}-{seed}",
-        base=own if own.exists() else weights.WEIGHTS / file, command=command(method, plant, budget, seed), threads=threads,
+        base=own if own.exists() else weights.WEIGHTS / file, command=weights.command(method, plant, budget, seed),
+        threads=threads,
     ).run()  # fmt: skip
 
 

@@ -6,10 +6,11 @@ first bytes, whatever they are called.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import subprocess
 from collections.abc import Mapping
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -120,7 +121,11 @@ def made_with() -> tuple[str, dict[str, str]]:
     done = subprocess.run(
         ["git", "describe", "--always", "--dirty"], cwd=Path(__file__).parent, capture_output=True, text=True, check=False
     )
-    return done.stdout.strip(), {name: version(name) for name in ("fdi-gym", "torch", "numpy", "scipy", "safetensors")}
+    found = {}
+    for name in ("fdi-gym", "torch", "numpy", "scipy", "scikit-learn", "safetensors"):
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return done.stdout.strip(), found
 
 
 def write(path: Path, tensors: dict[str, Array], card: Card) -> None:
@@ -132,6 +137,44 @@ def write(path: Path, tensors: dict[str, Array], card: Card) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path.with_suffix(".safetensors"), content)
     write_whole(path.with_suffix(".json"), msgspec.json.format(msgspec.json.encode(card), indent=1) + b"\n")
+
+
+def command(method: str, plant: Plant, budget: int | None, seed: int) -> str:
+    """What to type to train the same weights again."""
+    parts = ["fdi-gym train", method, plant.id, f"--budget {budget}" if budget else "", f"--seed {seed}" if seed else ""]
+    return " ".join(part for part in parts if part)
+
+
+def deliver(
+    method: str, plant: Plant, recipe: Any, seed: int, work: Path, tensors: dict[str, Array], command: str, **card: Any
+) -> Path:  # fmt: skip
+    """Write the weights of a method that learns in one go, and their card; their path.
+
+    Args:
+        method: Name of the trainer.
+        plant: The plant.
+        recipe: The flights that it was shown (`recipes.SequenceRecipe`).
+        seed: Of the run.
+        work: Folder of runs.
+        tensors: What was learned.
+        command: For the card.
+        card: What the card says beyond what every card says.
+    """
+    from baselines.learned.flights import PER_SEED, TRAINING, VALIDATION, plant_under
+
+    revision, versions = made_with()
+    first = TRAINING + PER_SEED * seed
+    last = first + recipe.identify + recipe.flights * recipe.candidates - 1
+    seeds = {"training": [first, last], "validation": [VALIDATION, VALIDATION + recipe.validation - 1]}
+    found = Card(
+        method=method, env=plant.env_id, plant=plant.id,
+        options=[dict(plant_under(plant, c).options) for c in recipe.conditions],
+        processes=[c.process for c in recipe.conditions], **names(plant),  # type: ignore[arg-type]
+        seeds=seeds | card.pop("seeds", {}), command=command, revision=revision, versions=versions, **card,
+    )  # fmt: skip
+    path = work / f"{method}-{plant.id}-{seed}" / f"{method}-{plant.id}.safetensors"
+    write(path, tensors, found)
+    return path
 
 
 def read_tensors(path: Path) -> dict[str, Array]:
@@ -233,15 +276,24 @@ def shape_of(path: Path, card: Card) -> tuple[FeatureShape, int]:
     Raises:
         RefusedError: One is missing, or not a whole number above 0 and up to its upper end.
     """
-    sizes: dict[str, int] = {}
-    for name in (*FeatureShape._fields, "hidden"):
-        value = card.shape.get(name, FeatureShape._field_defaults.get(name))
-        if type(value) is not int or not 1 <= value <= SIZES[name]:
-            what = f"a whole number above 0, up to {SIZES[name]}"
-            raise RefusedError(f"{path.with_suffix('.json')}: the shape's {name} is {what}, not {str(value)[:80]!r}")
-        sizes[name] = value
+    defaults = {**FeatureShape._field_defaults, **card.shape}
+    card = msgspec.structs.replace(card, shape=defaults)
+    sizes = {name: whole_number(path, card, name, SIZES[name]) for name in (*FeatureShape._fields, "hidden")}
     hidden = sizes.pop("hidden")
     return FeatureShape(**sizes), hidden
+
+
+def whole_number(path: Path, card: Card, name: str, most: int) -> int:
+    """A size that the card's shape gives.
+
+    Raises:
+        RefusedError: It is missing, or not a whole number from 1 to `most`.
+    """
+    value = card.shape.get(name)
+    if type(value) is not int or not 1 <= value <= most:
+        what = f"a whole number above 0, up to {most}"
+        raise RefusedError(f"{path.with_suffix('.json')}: the shape's {name} is {what}, not {str(value)[:80]!r}")
+    return value
 
 
 def calibration_of(path: Path, card: Card, process: str) -> ProbabilityCalibration:

@@ -1,4 +1,4 @@
-"""What methods know: fit, train."""
+"""What methods know, and what any could: fit, train, diagnosability."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ def fit(
     Args:
         plant: Plant or environment id; "module:id" where the module registers it.
         diagnosers: Names; "reference" for those that others are compared with first, "all" for every one that takes any.
+            What the file holds of others stays where names are given, as long as the plant's code is the one that it is of.
         jobs: Worker processes, -1 for one per core.
         output: Folder that gets PLANT.json. Default: `fits` in the package of the methods, whence they are read.
         renew: The plant's file has changed and its flights should not have: find some of the fits anew, and where they are
@@ -60,6 +61,8 @@ def fit(
         fits = knowledge.fit_suites(entries, suites, jobs)
     for path, found in fits.items():
         place = path if output is None else output / path.name
+        if diagnosers != ("all",):
+            found = knowledge.merged(place, found)
         knowledge.write_fits(place, found)
         print(f"{len(found.beliefs)} beliefs and {len(found.calibrations)} calibrations in {place}")
 
@@ -95,3 +98,31 @@ def train(
             output.mkdir(parents=True, exist_ok=True)
             write_whole(output / f"{path.stem}{suffix}", path.with_suffix(suffix).read_bytes())
     print(path if output is None else output / path.name)
+
+
+def diagnosability(
+    plant: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PLANT")],
+    process: str = "standard",
+    flights: int = 12,
+    seconds: float | None = None,
+    picture: Path | None = None,
+) -> None:
+    """Say which faults of a plant can be told apart, at what size and after how long, whatever the method.
+
+    Args:
+        plant: Plant or environment id; "module:id" where the module registers it.
+        process: Fault process, of whose flights the commands and noises are.
+        flights: Healthy flights that it is averaged over.
+        seconds: How long after the onset. Default: a third of a flight.
+        picture: File (.png, .pdf, .svg) that gets a picture of it.
+    """
+    from fdi_gym.diagnosability import diagnosability as measure
+    from fdi_gym.discovery import load_plant
+    from fdi_gym.listing import find_plant
+
+    if picture is not None and picture.suffix not in (".png", ".pdf", ".svg"):
+        raise ValueError(f"a picture is a .png, .pdf or .svg file, not {picture.name}")
+    found = measure(load_plant(find_plant(plant)[1]), process, flights=flights, seconds=seconds)
+    print(found.text())
+    if picture is not None:
+        found.picture().savefig(picture)

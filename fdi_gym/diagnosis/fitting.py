@@ -203,7 +203,9 @@ def fit_calibration(
     entry: Entry, plant: Plant, process: str, settings: Mapping[str, Any], belief: Belief | None
 ) -> Calibration:
     """When a method alarms: thresholds from healthy flights of the process, flown on and off the model as the test's are."""
-    given = {} if belief is None else {"belief": belief}
+    given: dict[str, Any] = {} if belief is None else {"belief": belief}
+    if entry.takes("process"):
+        given["process"] = process
 
     def build(calibration: Calibration) -> Any:
         return entry.build(plant, calibration=calibration, **given, **settings)

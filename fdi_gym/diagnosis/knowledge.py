@@ -157,6 +157,19 @@ def write_fits(path: Path, fits: Fits) -> None:
     write_whole(path, msgspec.json.format(to_json(fits), indent=0) + b"\n")
 
 
+def merged(path: Path, found: Fits) -> Fits:
+    """What was found, and what a file holds of the same plant code beside it: other methods', settings' and processes'."""
+    try:
+        old = from_json(path.read_bytes(), Fits)
+    except (OSError, ValueError):
+        return found
+    if (old.plant, old.code) != (found.plant, found.code):
+        return found
+    return msgspec.structs.replace(
+        found, beliefs={**old.beliefs, **found.beliefs}, calibrations={**old.calibrations, **found.calibrations}
+    )
+
+
 class Task(NamedTuple):
     """One fit: a method on a plant, a fault process and its settings."""
 
@@ -193,7 +206,9 @@ def fit_suites(entries: Sequence[Entry], suites: Sequence[Any], jobs: int = -1) 
     made = in_order([joblib.delayed(_belief)(t.plant, t.process) for t in wanted.values()], jobs)
     beliefs: dict[str, Belief | None] = dict(zip(wanted, made, strict=True))
     calls = [
-        joblib.delayed(_calibration)(t.entry.name, *t[1:], beliefs.get(belief_key(t.plant, t.process)))
+        joblib.delayed(_calibration)(
+            t.entry.name, *t[1:], beliefs[belief_key(t.plant, t.process)] if t.entry.takes("belief") else None
+        )
         for t in tasks.values() if t.entry.takes("calibration")
     ]  # fmt: skip
     found = dict(zip([k for k, t in tasks.items() if t.entry.takes("calibration")], in_order(calls, jobs), strict=True))

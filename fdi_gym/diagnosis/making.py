@@ -13,7 +13,7 @@ from fdi_gym.diagnosis.registry import find_diagnoser, find_trainer
 from fdi_gym.names import blame, blamed
 from fdi_gym.plant import NotApplicableError, Plant
 
-_EXTRA = ("torch", "stable_baselines3", "safetensors", "tensorboard")  # what "fdi-gym[learn]" brings
+_EXTRA = {**dict.fromkeys(("torch", "stable_baselines3", "safetensors", "tensorboard"), "learn"), "sklearn": "trees"}
 
 
 def make_diagnoser(
@@ -104,5 +104,5 @@ def train(
 
 def _missing(error: ModuleNotFoundError) -> NotApplicableError:
     library = (error.name or str(error)).split(".")[0]
-    remedy = ": pip install 'fdi-gym[learn]'" if library in _EXTRA else ", which is not installed"
+    remedy = f": pip install 'fdi-gym[{_EXTRA[library]}]'" if library in _EXTRA else ", which is not installed"
     return NotApplicableError(f"needs {library}{remedy}")
