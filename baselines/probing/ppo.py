@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,13 +20,33 @@ from fdi_gym.plant import Array, NotApplicableError, Plant
 FOLDER = Path(__file__).parent / "weights"
 
 
-def prober(plant: Plant, *, process: str = "standard", variant: str = "") -> Prober:
-    """The policy's likeliest probe.
+class Drawn(NamedTuple):
+    """The last probe (n,), decisions so far (n,), and each flight's place in its batch (n,), of which its draws are."""
+
+    last: Array
+    count: Array
+    place: Array
+
+
+def begin(n: int) -> Drawn:
+    """At the first decision."""
+    return Drawn(np.zeros(n, np.int64), np.zeros(n, np.int64), np.arange(n))
+
+
+def drawn(s: Drawn, logits: Array, seed: int) -> Drawn:
+    """A probe (n,) by the policy's probabilities; the likeliest is nearly always none, since a probe pays only at times."""
+    noise = [np.random.default_rng([seed, *key]).gumbel(size=logits.shape[1]) for key in zip(s.place, s.count, strict=True)]
+    return Drawn((logits + noise).argmax(axis=1), s.count + 1, s.place)
+
+
+def prober(plant: Plant, *, process: str = "standard", variant: str = "", seed: int = 0) -> Prober:
+    """A probe drawn by the policy.
 
     Args:
         plant: The plant.
         process: The fault process that it was trained for.
         variant: Of the training, as in the name of the file; "" for the one that is meant to be used.
+        seed: Of the draws; the i-th flight of a batch has its own.
 
     Raises:
         NotApplicableError: There are no weights.
@@ -37,11 +57,11 @@ def prober(plant: Plant, *, process: str = "standard", variant: str = "") -> Pro
         raise NotApplicableError(f"no probing policy {variant!r} was trained for {plant.id} and its process {process!r}")
     layers = {name: value.astype(float) for name, value in read_tensors(path).items()}
 
-    def choose(last: Array, obs: Array, said: Diagnosis) -> tuple[Array, Array]:
-        probe = actor(layers, features(plant, obs, said, last)).argmax(axis=1)
-        return probe, probe
+    def choose(s: Drawn, obs: Array, said: Diagnosis) -> tuple[Drawn, Array]:
+        s = drawn(s, actor(layers, features(plant, obs, said, s.last)), seed)
+        return s, s.last
 
-    return Prober(lambda n: np.zeros(n, np.int64), choose)
+    return Prober(begin, choose)
 
 
 def weights_of(plant_id: str, process: str, variant: str) -> Path:

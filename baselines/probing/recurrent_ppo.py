@@ -11,26 +11,27 @@ import numpy as np
 import scipy.special
 
 from baselines.learned.weights import read_tensors
-from baselines.probing.ppo import features, layer_names, weights_of
+from baselines.probing.ppo import Drawn, begin, drawn, features, layer_names, weights_of
 from fdi_gym.agents import Prober
 from fdi_gym.diagnosis.contract import Diagnosis
 from fdi_gym.plant import Array, NotApplicableError, Plant
 
 
 class Memory(NamedTuple):
-    """The last probe (n,), and the LSTM's output and cell (n, width)."""
+    """What has been drawn, and the LSTM's output and cell (n, width)."""
 
-    last: Array
+    drawn: Drawn
     h: Array
     c: Array
 
 
-def prober(plant: Plant, *, process: str = "standard") -> Prober:
-    """The policy's likeliest probe.
+def prober(plant: Plant, *, process: str = "standard", seed: int = 0) -> Prober:
+    """A probe drawn by the policy.
 
     Args:
         plant: The plant.
         process: The fault process that it was trained for.
+        seed: Of the draws; the i-th flight of a batch has its own.
 
     Raises:
         NotApplicableError: There are no weights.
@@ -43,7 +44,7 @@ def prober(plant: Plant, *, process: str = "standard") -> Prober:
     width = w["lstm.weight_hh"].shape[1]
 
     def choose(s: Memory, obs: Array, said: Diagnosis) -> tuple[Memory, Array]:
-        x = features(plant, obs, said, s.last)
+        x = features(plant, obs, said, s.drawn.last)
         i, f, g, o = np.split(x @ w["lstm.weight_ih"].T + s.h @ w["lstm.weight_hh"].T + w["lstm.bias"], 4, axis=1)
         c = scipy.special.expit(f) * s.c + scipy.special.expit(i) * np.tanh(g)
         h = scipy.special.expit(o) * np.tanh(c)
@@ -51,7 +52,7 @@ def prober(plant: Plant, *, process: str = "standard") -> Prober:
         for number, layer in enumerate(layers):
             y = y @ w[f"{layer}.weight"].T + w[f"{layer}.bias"]
             y = np.tanh(y) if number < len(layers) - 1 else y
-        probe = y.argmax(axis=1)
-        return Memory(probe, h, c), probe
+        now = drawn(s.drawn, y, seed)
+        return Memory(now, h, c), now.last
 
-    return Prober(lambda n: Memory(np.zeros(n, np.int64), np.zeros((n, width)), np.zeros((n, width))), choose)
+    return Prober(lambda n: Memory(begin(n), np.zeros((n, width)), np.zeros((n, width))), choose)
