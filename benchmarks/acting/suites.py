@@ -35,7 +35,7 @@ ACTIVE = {
     "b747-active": Suite("B747Lateral", {}, "quiet", 120, 10,
                          ("bayes_bank", "two_stage_kf", "augmented_ekf", "multiple_model_ekf"),
                          "level flight, no excitation: a weak surface that is not moved is not seen"),
-    "huav-active": Suite("HUAVHover", {}, "quiet", 80, 25, ("hypothesis_bank", "augmented_ekf"),
+    "huav-active": Suite("HUAVHover", {}, "quiet", 60, 25, ("hypothesis_bank", "augmented_ekf"),
                          "hover in still air: little moves but by the sensors' noise"),
     "missile-active": Suite("MissilePitch", {}, "standard", 90, 50, ("augmented_ekf", "mode_pursuit_ekf"),
                             "the standard flights, whose commanded incidence is zero in a third of the time"),
