@@ -82,7 +82,7 @@ def divergences(plant: Plant, process: str, window: int) -> Array:
     assert plant.acting is not None
     found = []
     for seed in SEEDS[:BASES]:
-        base = draw(plant.process("fault-free"), seed).replace(physical={})
+        base = draw(plant.process(process), seed).without_faults().replace(physical={})
         begins = min(onset, base.steps - window - 1)
         begun = [[msgspec.structs.replace(f, onset=begins, end=None) for f in some] for some in faults]
         scenarios = [base.replace(faults=some) for some in begun]

@@ -418,16 +418,20 @@ def acting(airframe: str, Ad: np.ndarray, Bd: np.ndarray, gain: np.ndarray) -> A
     """How the loop with this gain is acted on. The flight costs what its regulator minimises, over (5 deg of bank)^2."""
     Q, R = LQR[airframe]
 
-    @functools.lru_cache(maxsize=4096)
-    def designed(aileron: float, rudder: float) -> tuple[np.ndarray, np.ndarray]:
+    known: dict[tuple[float, ...], tuple[np.ndarray, np.ndarray]] = {}  # by the surfaces' effectiveness
+
+    def designed(*surfaces: float) -> tuple[np.ndarray, np.ndarray]:
         """Gain (2, 4) for surfaces of this effectiveness; what the other one deflects per deg of one that is stuck (2,)."""
-        left = np.array([aileron, rudder])
+        if surfaces in known:
+            return known[surfaces]
+        left = np.array(surfaces)
         K = gain if (left == 1.0).all() or not gain.any() else regulator(Ad, Bd * left, Q, R)
         trims = np.zeros(2)
         for i, j in ((0, 1), (1, 0)):  # so that the steady state costs least
             if left[i] == 0.0 < left[j]:
                 settled = np.linalg.solve(np.eye(4) - Ad + Bd * left @ K, Bd)
                 trims[i] = settled[:, i] @ Q @ settled[:, j] / (settled[:, j] @ Q @ settled[:, j])
+        known[surfaces] = K, trims
         return K, trims
 
     def flight_cost(x: np.ndarray, u: np.ndarray, r: np.ndarray) -> np.ndarray:
