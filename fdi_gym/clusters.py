@@ -77,7 +77,7 @@ class Futures(ParallelBackendBase):
 
     def compute_batch_size(self) -> int:
         """Calls that are handed over together."""
-        return max(1, self.total // (SHARES * self.parallel._cached_effective_n_jobs)) if self.slow else 1
+        return max(1, self.total // (SHARES * self.parallel._cached_effective_n_jobs)) if self.slow else 1  # type: ignore[union-attr]
 
     def submit(self, func: Any, callback: Any = None) -> Any:
         """Hand over a batch of calls."""
@@ -159,13 +159,13 @@ def _dask(told: Mapping[str, str], folder: Path) -> Iterator[Futures]:
     with _needs("dask"):
         import dask
         from distributed import Client
-    address = told.get("address") or dask.config.get("scheduler-address", None)
+    address = told.get("address") or dask.config.get("scheduler-address", None)  # type: ignore[attr-defined]
     if address is None:
         raise ValueError("which Dask cluster: --cluster address tcp://HOST:8786, or DASK_SCHEDULER_ADDRESS")
     client = Client(address, set_as_default=False, name="fdi-gym")
     try:
         executor = client.get_executor(pure=False)
-        yield Futures(executor, lambda: sum(client.ncores().values()))
+        yield Futures(executor, lambda: sum(client.ncores().values()))  # type: ignore[arg-type,union-attr]
         executor.shutdown(wait=False)
     finally:
         client.close()
@@ -177,14 +177,14 @@ def _ray(told: Mapping[str, str], folder: Path) -> Iterator[Futures]:
         import ray
 
     class Tasks:
-        run = staticmethod(ray.remote(max_retries=TRIES)(_there))
+        run: Any = staticmethod(ray.remote(max_retries=TRIES)(_there))  # type: ignore[arg-type]
 
         def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
             return self.run.remote(*arguments).future()
 
     began = not ray.is_initialized()
     if began:
-        ray.init(told.get("address", "auto"), log_to_driver=False, logging_level="ERROR")
+        ray.init(told.get("address", "auto"), log_to_driver=False, logging_level="ERROR")  # type: ignore[arg-type]
     try:
         yield Futures(Tasks(), lambda: int(ray.cluster_resources().get("CPU", 1)))
     finally:

@@ -257,7 +257,10 @@ def losses(pairs: Sequence[Compared], kind: str) -> dict[str, Loss]:
         names.append(pair.public.diagnoser)
         rows.append((float(gap), float(low), float(high)))
     real = holm(np.array(p)) < 1 - CONFIDENCE
-    return {name: Loss(*row, bool(one and row[0] > 0)) for name, row, one in zip(names, rows, real, strict=True)}
+    return {
+        name: Loss(row[0], row[1], row[2], bool(one and row[0] > 0))
+        for name, row, one in zip(names, rows, real, strict=True)
+    }
 
 
 KINDS = {"per_sample": "Isolation, per sample", "per_decision": "Isolation, per decision", "detection": "Detection"}
