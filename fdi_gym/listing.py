@@ -62,8 +62,8 @@ def _ids() -> dict[str, str]:
 
 def overview() -> str:
     """Names of all environments, suites, diagnosers and trainers, with a line for each; what is broken is listed as such."""
-    lines = ["Environments (those called -Active- are of plants that declare how they can be acted on)"]
-    lines += [f"  {name}-{{Faults,Active}}-v{source.version}" for name, source in plant_sources().items()]
+    lines = ["Environments (the second of a plant where it declares how it can be acted on)"]
+    lines += [f"  {name}-Faults-v{s.version} {name}-Active-v{s.version}" for name, s in plant_sources().items()]
     lines += ["", "Suites", *(f"  {name:32s} {_said(lambda n=name: load_suite(n).description)}" for name in suite_names())]
     marked = {name: "*" if GROUPS["reference"](entry) else "" for name, entry in diagnosers().items()}
     lines += ["", 'Diagnosers (*: in the group "reference"; "all" is the group of all)']

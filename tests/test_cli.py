@@ -374,7 +374,7 @@ def test_help_says_what_a_word_stands_for(capsys, command):
     assert {"evaluate": "SUITE", "verify": "ROW", "leaderboard": "PATH", "list": "NAME", "freeze": "PLANT",
             "train": "METHOD", "fit": "PLANT", "report": "SUITE", "plot": "SUITE",
             "diagnose": "FLIGHT", "collect": "FOLDER", "export": "SUITE", "new": "FOLDER",
-            "check": "NAME"}[command] in out  # fmt: skip
+            "check": "NAME", "diagnosability": "PLANT", "seal": "SUITE", "reveal": "ROUND"}[command] in out  # fmt: skip
 
 
 @pytest.mark.parametrize("arguments", [("list",), ("--help",), ("list", "B747Lateral"), ("list", "nothing")], ids=" ".join)

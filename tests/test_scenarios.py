@@ -389,7 +389,7 @@ FLOWN = {
     "another offset": ("line", lambda p: modes_with(p, offset=lambda m: tuple(np.add(m.offset, np.roll(m.direction, 1))))),
     "another mode's entry": ("line", swapped),
     "theta outside its range": ("theta", lambda p: {"theta": half(p.theta)}),
-    "outputs outside their range": ("range", lambda p: {"commands": half(p.commands)}),
+    "outputs outside their range": ("range", lambda p: {"commands": half(p.commands), "acting": None}),
     "estimates outside their range": ("estimated", lambda p: {"estimated": half(p.estimated)}),
     "negative sizes": ("size", lambda p: {"modes": [m._replace(size=lambda th, m=m: -1 - m.size(th)) for m in p.modes]}),
     "sizes of another shape": ("size", lambda p: {"modes": [m._replace(size=lambda th: th) for m in p.modes]}),

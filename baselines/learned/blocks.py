@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from baselines.learned.features import scaled
+from fdi_gym.estimation.equivalent import has_equivalents, nearest
 from fdi_gym.estimation.interval import Interval
 from fdi_gym.plant import Array, Plant
 
@@ -34,8 +35,17 @@ def begin(plant: Plant, length: int, n: int) -> Stream:
     return Stream(zeros, zeros, np.zeros(n, bool), np.zeros((n, length, width)), np.zeros(n, np.int64), np.zeros(n, bool))
 
 
+def _at_rest(plant: Plant) -> Array:
+    """What the outputs (n_y,) are at rest: of measurements that mean the same, the one nearest to it is taken."""
+    rest = np.array([s.nominal for s in plant.outputs])
+    rest[[parts[3] for parts in plant.quaternions]] = 1.0
+    return rest
+
+
 def add(plant: Plant, stride: int, s: Stream, at: Interval, y: Array, seen: Array) -> tuple[Stream, Array]:
     """With a sample: the state after it, and where it ended a block (n,) bool."""
+    if has_equivalents(plant):
+        y = nearest(plant, y, seen, np.tile(_at_rest(plant), (len(y), 1)))
     there = np.concatenate([seen, np.ones((len(y), len(plant.observed) - y.shape[1]), bool)], axis=1)
     now = np.where(there, scaled(plant, np.concatenate([y, at.u, at.known], axis=1)), 0.0)
     total, count = s.total + now, s.count + there

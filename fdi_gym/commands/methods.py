@@ -102,7 +102,7 @@ def train(
 
 def diagnosability(
     plant: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PLANT")],
-    process: str = "standard",
+    process: Annotated[str, tyro.conf.arg(metavar="PROCESS")] = "standard",
     flights: int = 12,
     seconds: float | None = None,
     picture: Path | None = None,
