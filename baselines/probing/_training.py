@@ -17,97 +17,87 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box, Discrete
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import VecEnv
 
 import fdi_gym  # noqa: F401 (registers the environments)
 from baselines.learned._reinforcement import actor_tensors
 from baselines.probing.ppo import features, weights_of
-from fdi_gym.diagnosis import make_diagnoser
+from fdi_gym.diagnosis import Diagnoser, make_diagnoser
 from fdi_gym.diagnosis.contract import choose
 from fdi_gym.plant import Array
+from fdi_gym.sb3 import FDIVecEnv
 
 TRAINING = 3_500_000  # first seed
 
 
-class BeliefEnv(VecEnv):
-    """Active environments with a diagnoser on board, as the policy sees them.
+class Believing(VectorWrapper):
+    """Active environments as a policy sees them whose diagnoser is on board: its features in, a probe out.
 
     Args:
-        plant_id: The plant.
-        process: Its fault process.
-        diagnoser: Name of the diagnoser.
-        n: Environments.
-        period: Decision period.
-        cost_weight: Factor on the price of a probe.
+        env: Active environments that probe, in physical units, `decision_period` above 1 and `autoreset_mode="SameStep"`.
+        on_board: The diagnoser.
     """
 
-    def __init__(self, plant_id: str, process: str, diagnoser: str, n: int, period: int, cost_weight: float):
-        self.envs: Any = gym.make_vec(
-            f"{plant_id}-Active-v0", num_envs=n, process=process, decision_period=period, cost_weight=cost_weight,
-            autoreset_mode=AutoresetMode.SAME_STEP,
-        )  # fmt: skip
-        self.plant = self.envs.unwrapped.plant
-        self.on_board = make_diagnoser(diagnoser, self.plant, process=process)
-        width = len(self.plant.labels) + len(self.plant.acting.probes) + len(self.plant.observed)
-        super().__init__(n, Box(-np.inf, np.inf, (width,), np.float32), Discrete(len(self.plant.acting.probes)))
+    def __init__(self, env: VectorEnv, on_board: Diagnoser):
+        super().__init__(env)
+        self.plant, self.on_board = env.unwrapped.plant, on_board  # type: ignore[attr-defined]
+        probes = len(self.plant.acting.probes)
+        width = len(self.plant.labels) + probes + len(self.plant.observed)
+        self.single_observation_space, self.single_action_space = (
+            Box(-np.inf, np.inf, (width,), np.float32),
+            Discrete(probes),
+        )
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self.action_space = batch_space(self.single_action_space, env.num_envs)
 
     def _see(self, block: Array) -> Array:
         for k in range(block.shape[1]):
             self.seen, self.said = self.on_board.update(self.seen, block[:, k])
         return features(self.plant, block[:, -1], self.said, self.last).astype(np.float32)
 
-    def reset(self) -> Array:
-        """Begin new flights."""
-        obs, _ = self.envs.reset(seed=TRAINING)
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Begin new flights in all environments."""
+        obs, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         self.last, self.seen = np.zeros(self.num_envs, np.int64), self.on_board.init(self.num_envs)
-        return self._see(obs[:, -1:])
+        return self._see(obs[:, -1:]), infos
 
-    def step_async(self, actions: Array) -> None:
-        """Keep the probes."""
+    def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """Fly on with these probes and what the diagnoser says; flights that end begin anew."""
         self.last = np.asarray(actions, np.int64)
-
-    def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:  # type: ignore[override]
-        """Fly on; flights that end begin anew."""
         label = np.clip(self.said.label, 0, len(self.plant.labels) - 1)
-        obs, reward, terminated, truncated, infos = self.envs.step(np.stack([label, self.last], axis=1))
-        done = terminated | truncated
-        block, unpacked = obs, [{} for _ in range(self.num_envs)]
+        obs, reward, terminated, truncated, infos = self.env.step(np.stack([label, self.last], axis=1))
+        done, block = terminated | truncated, obs
         if done.any():
             block = obs.copy()
             block[done] = np.stack(list(infos["final_obs"][done]))
         shown = self._see(block)
-        for i in np.flatnonzero(done):
-            unpacked[i] = {"terminal_observation": shown[i], "TimeLimit.truncated": bool(truncated[i])}
         if done.any():
+            final = np.empty(self.num_envs, dtype=object)
+            for i in np.flatnonzero(done):
+                final[i] = shown[i]
+            infos = {**infos, "final_obs": final}
             begun, said = self.on_board.update(self.on_board.init(self.num_envs), obs[:, -1])
             self.seen = choose(done, begun, self.seen)
             self.said = choose(done, said._replace(signals=None), self.said._replace(signals=None))
             self.last = np.where(done, 0, self.last)
             shown = np.where(done[:, None], features(self.plant, obs[:, -1], self.said, self.last), shown).astype(np.float32)
-        return shown, reward.astype(np.float32), done, unpacked
+        return shown, reward, terminated, truncated, infos
 
-    def close(self) -> None:
-        """Close the environments."""
-        self.envs.close()
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """One value for all."""
-        return [getattr(self.envs, attr_name, None)] * self.num_envs
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Not needed."""
-        raise NotImplementedError
-
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Not needed."""
-        raise NotImplementedError
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """No wrapper."""
-        return [False] * self.num_envs
+def environments(plant_id: str, process: str, diagnoser: str, n: int, period: int, cost_weight: float) -> FDIVecEnv:
+    """Environments of a plant's process with a diagnoser on board, for stable-baselines3."""
+    envs: Any = gym.make_vec(
+        f"{plant_id}-Active-v0", num_envs=n, process=process, decision_period=period, cost_weight=cost_weight,
+        autoreset_mode=AutoresetMode.SAME_STEP, truth=False,
+    )  # fmt: skip
+    venv = FDIVecEnv(Believing(envs, make_diagnoser(diagnoser, envs.unwrapped.plant, process=process)))
+    venv.seed(TRAINING)
+    return venv
 
 
 def lstm_tensors(state: Mapping[str, Any]) -> dict[str, Array]:
@@ -140,7 +130,7 @@ def main() -> None:
     parser.add_argument("--variant", default="")
     parser.add_argument("--recurrent", action="store_true", help="with an LSTM (sb3-contrib)")
     a = parser.parse_args()
-    env = BeliefEnv(a.plant, a.process, a.diagnoser, 32, a.period, a.cost_weight)
+    env = environments(a.plant, a.process, a.diagnoser, 32, a.period, a.cost_weight)
     shape: dict[str, Any] = {"net_arch": [64, 64], **({"lstm_hidden_size": 64} if a.recurrent else {})}
     agent = algorithm(a.recurrent)(
         "MlpLstmPolicy" if a.recurrent else "MlpPolicy", env, learning_rate=1e-3, n_steps=64, batch_size=512, n_epochs=6,

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -69,16 +68,10 @@ def weights_of(plant_id: str, process: str, variant: str) -> Path:
     return FOLDER / f"{'-'.join(part for part in ('ppo', plant_id, process, variant) if part)}.safetensors"
 
 
-def layer_names(tensors: Mapping[str, Array]) -> list[str]:
-    """The layers of a stored policy, first to last."""
-    return sorted({name.rpartition(".")[0] for name in tensors if name.startswith("layers.")})
-
-
 def features(plant: Plant, obs: Array, said: Diagnosis, last: Array) -> Array:
     """What the policy sees (n, labels + probes + n_obs): the belief, the last probe, the newest observation scaled."""
     assert plant.acting is not None
     labels = len(plant.labels)
     belief: Any = np.eye(labels)[np.clip(said.label, 0, labels - 1)] if said.label_probs is None else said.label_probs
-    nominal, scale = (np.array([getattr(s, name) for s in plant.observed]) for name in ("nominal", "scale"))
-    seen = np.clip(np.nan_to_num((obs - nominal) / scale), -5.0, 5.0)
+    seen = np.clip(np.nan_to_num(plant.scale(obs)), -5.0, 5.0)
     return np.concatenate([np.nan_to_num(belief), np.eye(len(plant.acting.probes))[last], seen], axis=1)

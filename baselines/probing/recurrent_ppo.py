@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy.special
 
+from baselines.learned.policy import actor
 from baselines.learned.weights import read_tensors
-from baselines.probing.ppo import Drawn, begin, drawn, features, layer_names, weights_of
+from baselines.probing.ppo import Drawn, begin, drawn, features, weights_of
 from fdi_gym.agents import Prober
 from fdi_gym.diagnosis.contract import Diagnosis
 from fdi_gym.plant import Array, NotApplicableError, Plant
@@ -48,11 +49,7 @@ def prober(plant: Plant, *, process: str = "standard", seed: int = 0) -> Prober:
         i, f, g, o = np.split(x @ w["lstm.weight_ih"].T + s.h @ w["lstm.weight_hh"].T + w["lstm.bias"], 4, axis=1)
         c = scipy.special.expit(f) * s.c + scipy.special.expit(i) * np.tanh(g)
         h = scipy.special.expit(o) * np.tanh(c)
-        y, layers = h, layer_names(w)
-        for number, layer in enumerate(layers):
-            y = y @ w[f"{layer}.weight"].T + w[f"{layer}.bias"]
-            y = np.tanh(y) if number < len(layers) - 1 else y
-        now = drawn(s.drawn, y, seed)
+        now = drawn(s.drawn, actor(w, h), seed)
         return Memory(now, h, c), now.last
 
     return Prober(lambda n: Memory(begin(n), np.zeros((n, width)), np.zeros((n, width))), choose)
