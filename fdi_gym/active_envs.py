@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode
 
 from fdi_gym.active_rules import ActiveRules, Choice
 from fdi_gym.acts import Acts, spent
-from fdi_gym.engine import Added, Record, advance
+from fdi_gym.engine import Added, Record, advance, recorded
 from fdi_gym.envs import FDIEnv
 from fdi_gym.faults import FaultScenario
 from fdi_gym.flights import Chunk, Flights
@@ -124,24 +124,17 @@ class ActiveEnv(FDIEnv):
         return {**super()._info(k), "cost": self._cost if k else 0.0, "unusable": self._unusable}
 
     def _whole(self) -> Record:
-        return record_of(self.plant, self._flown_chunks, 0, int(self._flights.length[0]))  # type: ignore[union-attr]
+        """The flight so far, as long as it will be: its newest sample stands for those to come."""
+        assert self._flights is not None
+        length = int(self._flights.length[0])
+        rows = [np.concatenate(parts)[: length + 1] for parts in zip(*self._flown_chunks, strict=True)]
+        whole = (np.concatenate([a, np.repeat(a[-1:], length + 1 - len(a), axis=0)]) for a in rows)
+        return recorded(self._flights, Chunk(*whole))
 
     def render(self) -> Array | None:
         """As `FDIEnv.render`; what has not been flown yet is not drawn."""
         self._record = None  # it has grown
         return super().render()
-
-
-def record_of(plant: Plant, chunks: list[Chunk], i: int, length: int) -> Record:
-    """One flight of what was flown so far, as long as it will be: the last sample stands for those to come."""
-
-    def whole(name: str) -> Array:
-        rows = np.concatenate([getattr(chunk, name)[:, i] for chunk in chunks])[: length + 1]
-        return np.concatenate([rows, np.repeat(rows[-1:], length + 1 - len(rows), axis=0)])[None]
-
-    obs, theta = whole("obs"), whole("theta")
-    target = plant.estimate_target(theta, plant.split(obs)[1])
-    return Record(obs, whole("state"), theta, target, whole("label"), np.array([length]), np.array([False]))
 
 
 class ActiveVectorEnv(FDIVectorEnv):

@@ -14,10 +14,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from fdi_gym.acts import Acts, accommodated, costs
-from fdi_gym.diagnosis.contract import Decisions, Diagnoser, Diagnosis
-from fdi_gym.engine import Record, advance
+from fdi_gym.diagnosis.contract import Decisions, Diagnoser, Diagnosis, Recording
+from fdi_gym.engine import Record, advance, hold_last, recorded
 from fdi_gym.faults import FaultScenario
-from fdi_gym.flights import Flights
+from fdi_gym.flights import Chunk, Flights
 from fdi_gym.plant import Array, Plant
 
 ALLOWING = ("nothing", "diagnosis", "truth")
@@ -71,7 +71,7 @@ def fly(
     acts = Acts(flights, prober is not NEVER, allow_for != "nothing")
     longest = int(flights.length.max())
     whole, probe, cost = flights.blank(longest + 1), np.zeros((longest + 1, n), np.int8), np.zeros((longest + 1, n))
-    said: list[Diagnosis] = []
+    recording = Recording(n, longest + 1)
     seen, chooses, unusable = diagnoser.init(n), prober.init(n), np.zeros(n, np.int64)
     first = 0
     while first <= longest:
@@ -80,22 +80,20 @@ def fly(
         added = acts.tables(samples)
         advance(flights, samples, whole, first, inputs=added.inputs, references=added.references)
         rows = slice(first, first + samples)
-        for array in whole[:4]:  # the last sample of a flight that is over stands for those to come
-            for i in np.flatnonzero(flights.over):
-                array[max(flights.length[i] + 1, first) : first + samples, i] = array[flights.length[i], i]
-        cost[rows] = np.where(over, 0.0, costs(flights, type(whole)(*(a[rows] for a in whole)), before))
+        hold_last(flights, Chunk(*(a[: first + samples] for a in whole)), first)
+        cost[rows] = np.where(over, 0.0, costs(flights, Chunk(*(a[rows] for a in whole)), before))
         probe[rows] = acts.probe
         for k in range(first, first + samples):
-            seen, newest = diagnoser.update(seen, whole.obs[k])
-            said.append(newest)
+            seen, said = diagnoser.update(seen, whole.obs[k])
+            recording.keep(k, said)
         first += samples
-        chooses, chosen = prober.choose(chooses, whole.obs[first - 1], said[-1])
+        chooses, chosen = prober.choose(chooses, whole.obs[first - 1], said)
         if allow_for != "nothing":
             if allow_for == "truth":
                 label, theta = whole.label[first - 1], whole.theta[first - 1]
                 estimate: Array | None = plant.estimate_target(theta, plant.split(whole.obs[first - 1])[1])
             else:
-                label, estimate = said[-1].label, said[-1].estimate
+                label, estimate = said.label, said.estimate
                 if estimate is not None:
                     unusable += ~np.isfinite(estimate).all(axis=1) & ~flights.over
             acts.accommodate(accommodated(plant, label, estimate))
@@ -103,21 +101,4 @@ def fly(
     planned = np.array([s.steps for s in scenarios])
     after = np.arange(longest + 1)[:, None]
     cost[(after > flights.length) & (after <= planned)] = acts.acting.lost
-    obs, state, theta, label = (a.swapaxes(0, 1) for a in whole)
-    target = plant.estimate_target(theta, plant.split(obs)[1])
-    record = Record(obs, state, theta, target, label, flights.length.copy(), flights.terminated)
-    return Flown(record, _decisions(said), probe.T, cost.T, unusable)
-
-
-def _decisions(said: list[Diagnosis]) -> Decisions:
-    def rows(name: str) -> Array | None:
-        values = [getattr(d, name) for d in said]
-        have = next((v for v in values if v is not None), None)
-        if have is None:
-            return None
-        return np.stack([np.full_like(have, np.nan) if v is None else v for v in values], axis=1)
-
-    alarm, label = (np.stack([getattr(d, name) for d in said], axis=1) for name in ("alarm", "label"))
-    return Decisions(
-        alarm, label.astype(np.int16), rows("estimate"), rows("estimate_std"), rows("label_probs"), rows("state")
-    )
+    return Flown(recorded(flights, whole), recording.decisions(), probe.T, cost.T, unusable)

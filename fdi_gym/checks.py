@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fdi_gym import shapes
-from fdi_gym.acting import Acting, wrong_acting
+from fdi_gym.acting import Acting, Probe
 from fdi_gym.data_sheet import Kernels
 from fdi_gym.faults import (
     Abrupt,
@@ -124,7 +124,7 @@ def _wrong(plant: Plant) -> Iterable[str]:
     if plant.acting is not None and not isinstance(plant.acting, Acting):
         yield f"acting is an Acting, not {plant.acting!r}"
     elif plant.acting is not None and plant.bare is None and not plant.simultaneous:
-        yield from wrong_acting(plant, plant.acting)
+        yield from _wrong_acting(plant, plant.acting)
 
 
 def twice(what: str, names: Sequence[Any]) -> Iterable[str]:
@@ -164,6 +164,51 @@ def _wrong_mode(mode: FaultMode, n: int) -> Iterable[str]:
             yield f"the mode {mode.name!r} has {name} in rising order, not {(low, high)}"
     if not any(mode.direction) and not any(mode.offset):
         yield f"the mode {mode.name!r} has an offset or a direction that moves something"
+
+
+def _wrong_acting(plant: Plant, acting: Acting) -> Iterable[str]:
+    if not callable(acting.flight_cost):
+        yield f"flight_cost is a function of x, u and r, not {acting.flight_cost!r}"
+    if isinstance(acting.lost, bool) or not isinstance(acting.lost, (int, float)) or not 0 < acting.lost < np.inf:
+        yield f"lost is a positive number, not {acting.lost!r}"
+    yield from twice("probes", [probe.name for probe in acting.probes])
+    for probe in acting.probes[1:]:
+        yield from _wrong_probe(plant, probe)
+    if acting.accommodate is not None:
+        q, n = np.asarray(plant.q, float), len(plant.estimated)
+        try:
+            found = np.asarray(acting.accommodate(np.tile(plant.healthy, (2, 1))), float)
+        except Exception as error:  # whatever the plant's author did not think of
+            yield f"accommodate fails for the healthy plant's estimate (2, {n}): {type(error).__name__}: {error}"
+            return
+        if found.shape != (2, q.size) or not (found == q).all():
+            yield f"accommodate gives the plant's parameters q (2, {q.size}) for the healthy plant, not {found!r}"
+
+
+def _wrong_probe(plant: Plant, probe: Probe) -> Iterable[str]:
+    n_u, q = len(plant.commands), np.asarray(plant.q, float)
+    if probe.command is None and probe.reference is None and probe.parameters is None:
+        yield f"the probe {probe.name!r} adds something to the command, the reference or the controller's parameters"
+    for name, width in (("command", n_u), ("reference", None)):
+        rows = getattr(probe, name)
+        if rows is None:
+            continue
+        rows = np.asarray(rows)
+        good = rows.ndim == 2 and len(rows) and rows.dtype.kind in "iuf" and np.isfinite(rows).all()
+        if not good or (width is not None and rows.shape[1] != width):
+            yield f"the probe {probe.name!r} has finite rows (T, {width or 'n_r'}) as its {name}, not the shape {rows.shape}"
+        elif name == "command":
+            for signal, column in zip(plant.commands, rows.T, strict=True):
+                low, high = signal.nominal + column.min(), signal.nominal + column.max()
+                if not signal.low <= low <= high <= signal.high:
+                    yield (
+                        f"the probe {probe.name!r} would bring {signal.name} from {low:g} to {high:g} {signal.unit}, beyond "
+                        f"the actuator's limits [{signal.low:g}, {signal.high:g}]"
+                    )
+    if probe.parameters is not None:
+        given = np.asarray(probe.parameters)
+        if given.shape != q.shape or given.dtype.kind not in "iuf" or not np.isfinite(given).all():
+            yield f"the probe {probe.name!r} has finite parameters ({q.size},), not {probe.parameters!r}"
 
 
 # ---------------------------------------------------------------------------------------------------------------

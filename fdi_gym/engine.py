@@ -154,11 +154,21 @@ def simulate(
     if not scenarios:
         raise ValueError("at least one scenario is needed")
     flights = Flights(plant, scenarios, noise)
-    longest = int(flights.length.max())
-    obs, state, theta, label = advance(flights, longest + 1, threads=threads)
-    for i in np.flatnonzero(flights.length < longest):
-        for array in (obs, state, theta, label):
-            array[flights.length[i] + 1 :, i] = array[flights.length[i], i]
-    obs, state, theta, label = (a.swapaxes(0, 1) for a in (obs, state, theta, label))
-    target = plant.estimate_target(theta, plant.split(obs)[1])
+    chunk = advance(flights, int(flights.length.max()) + 1, threads=threads)
+    hold_last(flights, chunk)
+    return recorded(flights, chunk)
+
+
+def hold_last(flights: Flights, chunk: Chunk, first: int = 0) -> None:
+    """From row `first` of a chunk on that begins at sample 0: a flight's last sample stands in the rows after its end."""
+    for i in np.flatnonzero(flights.length < len(chunk.label) - 1):
+        end = flights.length[i]
+        for array in chunk:
+            array[max(end + 1, first) :, i] = array[end, i]
+
+
+def recorded(flights: Flights, chunk: Chunk) -> Record:
+    """The record of a chunk that begins at sample 0."""
+    obs, state, theta, label = (a.swapaxes(0, 1) for a in chunk)
+    target = flights.plant.estimate_target(theta, flights.plant.split(obs)[1])
     return Record(obs, state, theta, target, label, flights.length.copy(), flights.terminated)

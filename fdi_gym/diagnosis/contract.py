@@ -77,6 +77,39 @@ class Decisions(NamedTuple):
     signals: dict[str, Array] | None = None  # (N, K + 1, ...) each, where they were asked for
 
 
+class Recording:
+    """What a diagnoser says of n flights, put down sample by sample.
+
+    Args:
+        n: Flights.
+        samples: How many there will be.
+        signals: Keep the method's own signals too.
+    """
+
+    def __init__(self, n: int, samples: int, signals: bool = False):
+        self._shape, self._signals = (n, samples), signals
+        self._alarm, self._label = np.zeros((n, samples), bool), np.zeros((n, samples), np.int16)
+        self._wide: dict[str, Array | None] = dict.fromkeys(("estimate", "estimate_std", "label_probs", "state"))
+        self._own: dict[str, Array] = {}
+
+    def keep(self, k: int, said: Diagnosis) -> None:
+        """Put down what was said of sample k."""
+        self._alarm[:, k], self._label[:, k] = said.alarm, said.label
+        for name in self._wide:
+            value = getattr(said, name)
+            if value is not None:
+                store = self._wide[name]
+                if store is None:
+                    store = self._wide[name] = np.full((*self._shape, value.shape[1]), np.nan)
+                store[:, k] = value
+        for name, value in (said.signals or {}).items() if self._signals else ():
+            self._own.setdefault(name, np.full((*self._shape, *value.shape[1:]), np.nan))[:, k] = value
+
+    def decisions(self) -> Decisions:
+        """All of it."""
+        return Decisions(self._alarm, self._label, **self._wide, signals=self._own or None)
+
+
 def run(diagnoser: Diagnoser, obs: Array, signals: bool = False) -> Decisions:
     """Show recorded observations (N, K + 1, n_obs) to a diagnoser, sample by sample, and record what it says.
 
@@ -86,23 +119,11 @@ def run(diagnoser: Diagnoser, obs: Array, signals: bool = False) -> Decisions:
         signals: Record the method's own signals too.
     """
     n, samples, _ = obs.shape
-    state = diagnoser.init(n)
-    alarm, label = np.zeros((n, samples), bool), np.zeros((n, samples), np.int16)
-    wide: dict[str, Array | None] = dict.fromkeys(("estimate", "estimate_std", "label_probs", "state"))
-    own: dict[str, Array] = {}
+    state, recording = diagnoser.init(n), Recording(n, samples, signals)
     for k in range(samples):
         state, said = diagnoser.update(state, obs[:, k])
-        alarm[:, k], label[:, k] = said.alarm, said.label
-        for name in wide:
-            value = getattr(said, name)
-            if value is not None:
-                store = wide[name]
-                if store is None:
-                    store = wide[name] = np.full((n, samples, value.shape[1]), np.nan)
-                store[:, k] = value
-        for name, value in (said.signals or {}).items() if signals else ():
-            own.setdefault(name, np.full((n, samples, *value.shape[1:]), np.nan))[:, k] = value
-    return Decisions(alarm, label, **wide, signals=own or None)
+        recording.keep(k, said)
+    return recording.decisions()
 
 
 # ---------------------------------------------------------------------------------------------------------------
