@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode
 
 from fdi_gym.active_rules import ActiveRules, Choice
 from fdi_gym.acts import Acts, spent
-from fdi_gym.engine import Added, Record, advance, recorded
+from fdi_gym.engine import Added, Record, recorded
 from fdi_gym.envs import FDIEnv
 from fdi_gym.faults import FaultScenario
 from fdi_gym.flights import Chunk, Flights
@@ -85,8 +85,7 @@ class ActiveEnv(FDIEnv):
             self._acts.begin(np.zeros(1, np.int64))
         assert self._acts is not None
         first = flights.k.copy()
-        added = self._acts.tables(self._ahead)
-        chunk = advance(flights, self._ahead, inputs=added.inputs, references=added.references)
+        chunk = self._acts.advance(self._ahead)
         if self._flown:
             self._cost = float(spent(flights, chunk, first)[0]) / self._active.period
             if flights.terminated[0] and self.scenario is not None:

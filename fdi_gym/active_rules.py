@@ -12,7 +12,7 @@ from fdi_gym.acts import accommodated, acting_of, probe_prices
 from fdi_gym.checks import is_finite
 from fdi_gym.plant import Array
 from fdi_gym.rules import Rules
-from fdi_gym.tasks import holds_bool
+from fdi_gym.tasks import numbers, scaled
 
 TASKS = ("isolation", "diagnosis")  # those whose answer says something about the fault that acts now
 
@@ -73,7 +73,9 @@ class ActiveRules(Rules):
         if discrete and not self.probing:
             return Choice(action, none, none > 0)
         wanted = (*shape, width) if self.probing else (*shape, *self._said_space.shape)  # type: ignore[misc]
-        value = self._numbers(action, wanted)
+        value = numbers(action, wanted)
+        if value is None:
+            raise ValueError(f"the action holds numbers in the shape {wanted}, not {action!r}")
         if discrete:
             if value.dtype.kind not in "iu" or not ((value >= 0) & (value < [self._labels, self.probes])).all():
                 names = ", ".join(f"{i} {probe.name}" for i, probe in enumerate(self.acting.probes))
@@ -98,18 +100,8 @@ class ActiveRules(Rules):
 
     def _healthy(self) -> Array:
         """The healthy plant's estimate, in the units of an action."""
-        low, high = (np.asarray([getattr(s, name) for s in self.plant.estimated], float) for name in ("low", "high"))
-        span = np.where(high > low, high - low, 1.0)
-        return 2 * (self.plant.healthy - low) / span - 1 if self.scaled else self.plant.healthy
-
-    def _numbers(self, action: Any, wanted: tuple[int, ...]) -> Array:
-        try:
-            value = np.asarray(action)
-        except Exception:  # an object may refuse in its own way
-            value = np.empty((0,))
-        if value.shape != wanted or value.dtype.kind not in "iuf" or holds_bool(action):
-            raise ValueError(f"the action holds numbers in the shape {wanted}, not {action!r}")
-        return value
+        low, high = np.array([(s.low, s.high) for s in self.plant.estimated], float).T
+        return scaled(self.plant.healthy, low, high) if self.scaled else self.plant.healthy
 
     def allowed_for(self, answer: Array, unusable: Array) -> Array:
         """The estimated quantities (n, n_estimated) that the controllers allow for after the task's answers (n, ...)."""

@@ -112,6 +112,11 @@ class Acts:
         self.phase += samples
         return Added(**found)
 
+    def advance(self, samples: int, into: Chunk | None = None, first: int = 0) -> Chunk:
+        """Fly all flights on by so many samples, with what acts on them; arguments as in `fdi_gym.engine.advance`."""
+        added = self.tables(samples)
+        return advance(self.flights, samples, into, first, inputs=added.inputs, references=added.references)
+
 
 def costs(flights: Flights, chunk: Chunk, k: Array) -> Array:
     """What the samples (m, N) of a chunk cost, which begins at the samples k (N,); 0 after the end of a flight."""
@@ -147,11 +152,9 @@ def probe_prices(plant: Plant) -> tuple[float, ...]:
     for number in range(len(acting.probes)):
         flights = Flights(plant, scenarios)
         acts, steps = Acts(flights, accommodation=False), int(flights.length.max())
-        chunk = advance(flights, 1)
+        advance(flights, 1)
         acts.choose(np.full(len(flights), number))
-        added = acts.tables(steps)
-        chunk = advance(flights, steps, inputs=added.inputs, references=added.references)
-        total = costs(flights, chunk, np.ones(len(flights), np.int64)).sum(axis=0)
+        total = costs(flights, acts.advance(steps), np.ones(len(flights), np.int64)).sum(axis=0)
         lost = acting.lost * (np.array([s.steps for s in scenarios]) - flights.length)
         means.append(float(((total + lost) / [s.steps for s in scenarios]).mean()))
     return tuple(max(mean - means[0], 0.0) for mean in means)

@@ -15,7 +15,7 @@ import numpy as np
 
 from fdi_gym.acts import Acts, accommodated, costs
 from fdi_gym.diagnosis.contract import Decisions, Diagnoser, Diagnosis, Recording
-from fdi_gym.engine import Record, advance, hold_last, recorded
+from fdi_gym.engine import Record, hold_last, recorded
 from fdi_gym.faults import FaultScenario
 from fdi_gym.flights import Chunk, Flights
 from fdi_gym.plant import Array, Plant
@@ -77,8 +77,7 @@ def fly(
     while first <= longest:
         samples = min(period, longest + 1 - first) if first else 1
         over, before = flights.over.copy(), flights.k.copy()
-        added = acts.tables(samples)
-        advance(flights, samples, whole, first, inputs=added.inputs, references=added.references)
+        acts.advance(samples, whole, first)
         rows = slice(first, first + samples)
         hold_last(flights, Chunk(*(a[: first + samples] for a in whole)), first)
         cost[rows] = np.where(over, 0.0, costs(flights, Chunk(*(a[rows] for a in whole)), before))

@@ -201,13 +201,20 @@ class Plant(Truth):
         n_y, n_u = len(self.outputs), len(self.commands)
         return obs[..., :n_y], obs[..., n_y : n_y + n_u], obs[..., n_y + n_u :]
 
+    @functools.cached_property
+    def _scaling(self) -> tuple[Array, Array]:
+        """Nominal values and scales of the observations (n_obs,)."""
+        return np.array([s.nominal for s in self.observed], float), np.array([s.scale for s in self.observed], float)
+
     def scale(self, obs: Array) -> Array:
         """Observations (..., n_obs) as `units="scaled"` shows them: how many scales of the data sheet off nominal."""
-        return (obs - np.array([s.nominal for s in self.observed])) / np.array([s.scale for s in self.observed])
+        nominal, scale = self._scaling
+        return (obs - nominal) / scale
 
     def unscale(self, obs: Array) -> Array:
         """The inverse of `scale`: scaled observations (..., n_obs) in the units of the data sheet."""
-        return obs * np.array([s.scale for s in self.observed]) + np.array([s.nominal for s in self.observed])
+        nominal, scale = self._scaling
+        return obs * scale + nominal
 
     def estimate_target(self, theta: Array, u: Array) -> Array:
         """What the identification task asks for, from theta (..., n_theta) and the command held with it (..., n_u)."""

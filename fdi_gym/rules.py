@@ -160,11 +160,10 @@ class Rules:
         seen = self.plant.observed
         low, high = _column(seen, "low"), _column(seen, "high")
         self.scaled = units == "scaled"
-        self._nominal, self._scale = _column(seen, "nominal"), _column(seen, "scale")
         dtype = np.float32 if self.scaled else np.float64
         if self.scaled:  # a rounding step wider, so that the cast to float32 cannot leave the space
-            low = np.nextafter(np.float32((low - self._nominal) / self._scale), np.float32(-np.inf))
-            high = np.nextafter(np.float32((high - self._nominal) / self._scale), np.float32(np.inf))
+            low = np.nextafter(np.float32(self.plant.scale(low)), np.float32(-np.inf))
+            high = np.nextafter(np.float32(self.plant.scale(high)), np.float32(np.inf))
         if self.period > 1:
             low, high = np.tile(low, (self.period, 1)), np.tile(high, (self.period, 1))
         self.observation_space = Readings(low, high, dtype=dtype)
@@ -215,7 +214,7 @@ class Rules:
 
     def show(self, obs: Array) -> Array:
         """An observation in the units that were asked for; always a new array."""
-        return ((obs - self._nominal) / self._scale).astype(np.float32) if self.scaled else obs.copy()
+        return self.plant.scale(obs).astype(np.float32) if self.scaled else obs.copy()
 
     def final(self, answers: Array, scenarios: Sequence[FaultScenario]) -> Array:
         """What the last answers (n, ...) of episodes are worth in a task that is judged at their end.

@@ -76,18 +76,28 @@ def _array(action: Any) -> Array:
         return np.empty((0,))
 
 
+def numbers(action: Any, shape: tuple[int, ...]) -> Array | None:
+    """An action as an array, if it holds numbers in this shape; NaN is one."""
+    value = _array(action)
+    return value if value.shape == shape and value.dtype.kind in "iuf" and not holds_bool(action) else None
+
+
+def scaled(value: Array, low: Array, high: Array) -> Array:
+    """Values (..., n) between bounds (n,) as numbers in [-1, 1]."""
+    return 2 * (value - low) / np.where(high > low, high - low, 1.0) - 1
+
+
 def checked_box(action: Any, shape: tuple[int, ...]) -> Array:
     """An action as finite float64 of this shape.
 
     Raises:
         ValueError: It is not.
     """
-    value = _array(action)
-    good = value.shape == shape and value.dtype.kind in "iuf" and not holds_bool(action)
-    if good:
+    value = numbers(action, shape)
+    if value is not None:
         with np.errstate(over="ignore"):
             value = value.astype(np.float64)
-    if not good or not np.isfinite(value).all():
+    if value is None or not np.isfinite(value).all():
         raise ValueError(f"the action is finite and has the shape {shape}, not {action!r}")
     return value
 
@@ -243,8 +253,7 @@ class Scenario(_Boxed):
             value[..., PRESENT::COLUMNS] >= 0.5, value[..., SIZE::COLUMNS], self.low[SIZE::COLUMNS]
         )
         if self.scaled:
-            span = np.where(self.high > self.low, self.high - self.low, 1.0)
-            value = (2 * (value - self.low) / span - 1).astype(np.float32)
+            value = scaled(value, self.low, self.high).astype(np.float32)
         return value
 
 

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.learned.features import scaled
 from fdi_gym.estimation.equivalent import has_equivalents, nearest
 from fdi_gym.estimation.interval import Interval
 from fdi_gym.plant import Array, Plant
@@ -47,7 +46,7 @@ def add(plant: Plant, stride: int, s: Stream, at: Interval, y: Array, seen: Arra
     if has_equivalents(plant):
         y = nearest(plant, y, seen, np.tile(_at_rest(plant), (len(y), 1)))
     there = np.concatenate([seen, np.ones((len(y), len(plant.observed) - y.shape[1]), bool)], axis=1)
-    now = np.where(there, scaled(plant, np.concatenate([y, at.u, at.known], axis=1)), 0.0)
+    now = np.where(there, plant.scale(np.concatenate([y, at.u, at.known], axis=1)), 0.0)
     total, count = s.total + now, s.count + there
     held = s.held if at.held is None else s.held | at.held
     ends = (at.k + 1) % stride == 0
@@ -64,7 +63,7 @@ def add(plant: Plant, stride: int, s: Stream, at: Interval, y: Array, seen: Arra
 def of_flights(plant: Plant, obs: Array, stride: int) -> Array:
     """The blocks of recorded flights (N, K + 1, n_obs): (N, (K + 1) // stride, n_obs)."""
     n, samples, width = obs.shape
-    return scaled(plant, obs[:, : samples // stride * stride]).reshape(n, -1, stride, width).mean(axis=2)
+    return plant.scale(obs[:, : samples // stride * stride]).reshape(n, -1, stride, width).mean(axis=2)
 
 
 def windows(blocks: Array, length: int) -> Array:

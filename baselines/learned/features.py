@@ -59,11 +59,6 @@ class FeatureModel(NamedTuple):
     std: Array  # (n_features,)
 
 
-def scaled(plant: Plant, obs: Array) -> Array:
-    """Observations (..., n_obs) as (value - nominal) / scale."""
-    return (obs - np.array([s.nominal for s in plant.observed])) / np.array([s.scale for s in plant.observed])
-
-
 def deviation(plant: Plant, target: Array) -> Array:
     """The estimated quantity (..., n_estimated) as (value - healthy) / scale."""
     healthy = plant.healthy
@@ -73,7 +68,7 @@ def deviation(plant: Plant, target: Array) -> Array:
 def blocks(plant: Plant, obs: Array, stride: int) -> Array:
     """Recorded observations (N, K + 1, n_obs) as (N, (K + 1) // stride, 2, n_obs): mean and newest of each block."""
     n, samples, width = obs.shape
-    z = scaled(plant, obs[:, : samples // stride * stride]).reshape(n, -1, stride, width)
+    z = plant.scale(obs[:, : samples // stride * stride]).reshape(n, -1, stride, width)
     return np.stack([z.mean(axis=2), z[:, :, -1]], axis=2)
 
 
@@ -226,7 +221,7 @@ def add(
     plant: Plant, shape: FeatureShape, model: FeatureModel, stream: Stream, obs: Array, k: int
 ) -> tuple[Stream, Array | None]:  # fmt: skip
     """Sample k (n, n_obs): the state after it and, at the end of a step, what `features` has there (n, n_features)."""
-    newest = scaled(plant, obs)
+    newest = plant.scale(obs)
     stream = stream._replace(count=stream.count + 1, total=stream.total + newest)
     if (k + 1) % shape.stride:
         return stream, None

@@ -93,8 +93,7 @@ def divergences(plant: Plant, process: str, window: int) -> Array:
             acts = Acts(flights, accommodation=False)
             advance(flights, begins)
             acts.choose(np.full(len(flights), number))
-            added = acts.tables(window)
-            chunk = advance(flights, window, inputs=added.inputs, references=added.references)
+            chunk = acts.advance(window)
             nu = _innovations(plant, filtered, chunk.state[0], chunk.obs, begins)  # (window, flights, n_s), whitened
             D = 0.5 * ((nu[:, :, None] - nu[:, None]) ** 2).sum(axis=(0, 3))
             apart = np.zeros((len(plant.labels), len(plant.labels)))

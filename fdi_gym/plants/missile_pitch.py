@@ -430,13 +430,6 @@ def flight_cost(x: np.ndarray, u: np.ndarray, r: np.ndarray) -> np.ndarray:
     return error**2 + 0.1 * (fin**2 + u[..., 1] ** 2)
 
 
-def accommodate(theta: np.ndarray) -> np.ndarray:
-    """q (n, 12) for an estimated theta (n, 5): it is allowed for in the inversion, as far as the effectors go."""
-    n, most = len(theta), np.array([1.5, 1.5, 0.8, 1.0, 0.8])
-    allowed = np.clip(theta, [-1.5, -1.5, 0.0, 0.0, 0.0], most)
-    return np.concatenate([np.tile(prefilter(), (n, 1)), allowed, np.zeros((n, 1))], axis=1)
-
-
 PROBES = (
     Probe("dither", f"the jet by 0.2 at a period of {DITHER_PERIOD:g} s, and the fin against it: no moment without a fault",
           parameters=np.array([0.0] * 11 + [0.2])),
@@ -457,6 +450,14 @@ def plant(*, noise_scale: float = 1.0, fault_scale: float = 1.0) -> Plant:
     """
     noise_scale, fault_scale = number("noise_scale", noise_scale, 0.0, 100.0), number("fault_scale", fault_scale, 1e-6, 2.0)
     sigma = [noise_scale * s for s in SIGMA]
+    q = np.concatenate([prefilter(), np.zeros(6)])
+
+    def accommodate(theta: np.ndarray) -> np.ndarray:
+        """q (n, 12) for an estimated theta (n, 5): it is allowed for in the inversion, as far as the effectors go."""
+        law = np.tile(q, (len(theta), 1))
+        law[:, 6:11] = np.clip(theta, [-1.5, -1.5, 0.0, 0.0, 0.0], [1.5, 1.5, 0.8, 1.0, 0.8])
+        return law
+
     reward = np.full((6, 6), -1.0)  # a wrong fault label, or one without a fault
     reward[1:, 0] = -0.5  # missed
     np.fill_diagonal(reward, 0.0)
@@ -488,7 +489,7 @@ def plant(*, noise_scale: float = 1.0, fault_scale: float = 1.0) -> Plant:
         modes=_modes(),
         labels=(Label("none", frozenset()), *(Label(name, frozenset({name})) for name in MODES)),
         processes=_processes(fault_scale),
-        c0=np.zeros(6), q=np.concatenate([prefilter(), np.zeros(6)]), physical=physical, perturb=perturb,
+        c0=np.zeros(6), q=q, physical=physical, perturb=perturb,
         reference=reference_rows, disturbance=disturbance_rows, measured_disturbance=measured_disturbance,
         shapes=Shapes(Reference, Flow, Physical), noise_limit=CLIP, isolation_reward=reward,
         acting=Acting(flight_cost=flight_cost, lost=100.0, probes=PROBES, accommodate=accommodate),
