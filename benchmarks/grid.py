@@ -88,10 +88,8 @@ def reasons_of(suite: AnySuite) -> dict[str, str]:
     return applicable(suite, suite.build(), list(diagnosers()))[1]
 
 
-def run(arguments: Arguments) -> dict[str, Any]:
-    """Fill the grid: the missing rows, then the figures beside them."""
-    suites = [load_suite(f"{family}-{kind}") for kind in KINDS for family in arguments.plants]
-    reasons = {suite.name: reasons_of(suite) for suite in suites}
+def run(arguments: Arguments, suites: list[AnySuite], reasons: dict[str, dict[str, str]]) -> dict[str, Any]:
+    """Fill the grid: the missing rows, then the figures beside them, which are given."""
     for suite in suites:
         for name in diagnosers():  # one after the other: each row is written as soon as it is there
             if name in reasons[suite.name] or row_path(arguments.results, suite.name, name).exists():
@@ -101,7 +99,7 @@ def run(arguments: Arguments) -> dict[str, Any]:
             write_rows(arguments.results, suite, found)
     jobs: dict[str, Any] = {f"{s.name}.{name}": (consistency_piece, (s, name))
                             for s in suites for name in FILTERS if name not in reasons[s.name]}  # fmt: skip
-    return {"consistency": pieces(arguments.work / "consistency", jobs, arguments.jobs), "reasons": reasons}
+    return pieces(arguments.work / "consistency", jobs, arguments.jobs)
 
 
 def accuracy(row: Row) -> tuple[float, float, float]:
@@ -206,10 +204,12 @@ def main(arguments: Arguments) -> None:
     """Fill the grid and write its page."""
     kept = arguments.page.with_name("grid.json")
     figures = read_json(kept, dict[str, Any], "grid's figures") if kept.exists() else {}
-    if not arguments.page_only:
-        for part, found in run(arguments).items():
-            figures[part] = {**figures.get(part, {}), **found}
-        write_whole(kept, pretty(figures))
+    suites = [load_suite(f"{family}-{kind}") for kind in KINDS for family in arguments.plants]
+    reasons = {suite.name: reasons_of(suite) for suite in suites}
+    measured = {} if arguments.page_only else run(arguments, suites, reasons)
+    for part, found in (("consistency", measured), ("reasons", reasons)):
+        figures[part] = {**figures.get(part, {}), **found}
+    write_whole(kept, pretty(figures))
     write_whole(arguments.page, page(arguments.results, figures).encode())
     print(arguments.page)
 

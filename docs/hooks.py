@@ -6,7 +6,7 @@
 - methods.md: every diagnoser with its settings
 - boards/...: leaderboards/ as it is, with its pictures
 - reference/<module>.md: the public modules, for mkdocstrings
-- reports/<suite>.html: a report for each suite that has rows
+- reports/<suite>.html: a report for each suite that mkdocs.yml names (`extra.reports`); `fdi-gym report` makes the others
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import logging
 import posixpath
 import re
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +58,8 @@ def on_config(config: Any) -> Any:
         "@suites": ["suites/index.md", *({name: f"suites/{name}.md"} for name in suite_names())],
         "@boards": ["boards/README.md", {"Grid of methods and plants": "boards/grid.md"},
                     {"Learned": "boards/learning/README.md"}, {"Coverage of the intervals": "boards/coverage.md"},
-                    {"Acting": "boards/acting.md"},
+                    {"Acting": "boards/acting.md"}, {"Sensors": "boards/sensors.md"}, {"Missing samples": "boards/gaps.md"},
+                    {"Structural isolability": "boards/isolability.md"},
                     *({path.stem: f"boards/{path.name}"} for path in sorted(BOARDS.glob("*-*.md")))],
         "@reproduction": ["boards/reproduction/README.md",
                           *({path.stem: f"boards/reproduction/{path.name}"} for path in _reproduction())],
@@ -85,7 +85,7 @@ def on_files(files: Files, config: Any) -> Files:
             texts[uri] = _within(path.read_text(encoding="utf-8"), uri, set(mirrored))
     texts["contributing.md"] = _within((ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"), "contributing.md", set())
     logging.getLogger("fdi_gym").setLevel(logging.ERROR)
-    found = dict(_reports())
+    found = {f"reports/{name}.html": _report(name) for name in config.extra["reports"]}
     texts["index.md"] = _front((Path(config.docs_dir) / "index.md").read_text(encoding="utf-8"), list(found))
     old = files.get_file_from_path("index.md")
     if old is not None:
@@ -119,20 +119,12 @@ def _within(text: str, uri: str, known: set[str]) -> str:
 # Reports
 
 
-def _reports() -> Iterator[tuple[str, str]]:
-    for name in suite_names():
-        folder = BOARDS / "results" / name
-        if folder.is_dir():
-            yield (
-                f"reports/{name}.html",
-                report(read_board(folder, {name: load_suite(name)}), flights=FLIGHTS, progress=False),
-            )
+def _report(name: str) -> str:
+    return report(read_board(BOARDS / "results" / name, {name: load_suite(name)}), flights=FLIGHTS, progress=False)
 
 
 def _front(text: str, reports: list[str]) -> str:
     """The first page: it shows the first report, and leads to the others."""
-    if not reports:
-        return text.replace("{{report}}", "There are no rows yet.")
     links = " ".join(f"[{Path(uri).stem}]({uri})" for uri in reports)
     frame = f'<iframe class="report" src="{reports[0]}" title="{Path(reports[0]).stem}"></iframe>'
     return text.replace("{{report}}", f"{frame}\n\nReports: {links}")

@@ -73,4 +73,4 @@ def test_diagnoser(plant_id, name):
         make(build(plant_id), [draw(build(plant_id).processes["standard"], 0)])
     except NotApplicableError as reason:
         pytest.skip(str(reason))
-    check_diagnoser(make, build(plant_id), samples=240)
+    check_diagnoser(make, build(plant_id), samples=150)

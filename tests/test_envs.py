@@ -8,7 +8,7 @@ import cloudpickle
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import build
+from conftest import PLANTS, build
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
@@ -209,8 +209,12 @@ def test_episodes_of_the_process_differ_and_repeat():
     assert not np.array_equal(first[1], first[2])
 
 
-@pytest.mark.parametrize("task", list(TASKS))
-def test_pictures(plant, task):
+@pytest.mark.parametrize(
+    ("plant_id", "task"),
+    [*((plant_id, "isolation") for plant_id in PLANTS), *(("B747Lateral", task) for task in TASKS if task != "isolation")],
+)
+def test_pictures(plant_id, task):
+    plant = build(plant_id)
     env = FDIEnv(plant.id, task=task, render_mode="rgb_array")
     env.reset(seed=1)
     blank = env.render()

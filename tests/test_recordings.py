@@ -129,6 +129,12 @@ def test_order_repetition_and_missing_times_are_mended_and_said(flight):
     assert all(word in text for word in ("out of order", "1 rows have the time of the one before", "1 rows without a time"))
 
 
+def test_several_flights_in_one_file_are_refused(flight):
+    plant, _, frame = flight
+    with pytest.raises(RefusedError, match="begin again 2 times: it holds several flights"):
+        observations(plant, rows(frame, np.r_[0:1201, 0:1201, 0:600]))
+
+
 @pytest.mark.parametrize("jitter", [0.01, 0.04])
 def test_jitter_is_said_and_costs_little(flight, jitter):
     plant, record, frame = flight

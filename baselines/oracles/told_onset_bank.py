@@ -89,7 +89,9 @@ class Bank(NamedTuple):
     log: Array  # (n, r) log likelihood since the last change
     changes: Array  # (n, K + 1) bool
     acts: Array  # (n, K + 1) bool
+    course: Array  # (n, K + 1) size of what acts, as a share of its largest; (n, 1) where that is not told
     now: Array  # (n,) bool: a fault acts
+    share: Array  # (n,) of the course
     nu: Array  # (n, m) innovation of the healthy filter
     S: Array  # (n, m, m) its covariance
     checks: Checks | None
@@ -111,9 +113,20 @@ def told_onset_bank(plant: Plant, belief: Belief, *, scenarios: Sequence[FaultSc
     Raises:
         ValueError (from init): The number of episodes is not that of the scenarios.
     """
-    r = rows(plant, belief)
+    return told_bank(plant, rows(plant, belief), scenarios, None)
+
+
+def told_bank(plant: Plant, r: Rows, scenarios: Sequence[FaultScenario], course: Array | None) -> Diagnoser:
+    """The bank, told of n flights.
+
+    Args:
+        plant: The plant.
+        r: Its hypotheses.
+        scenarios: n of them.
+        course: (n, K + 1) by which the hypotheses' lines are scaled at each sample; None: they keep their lengths.
+    """
     model, z, x, count = r.model, r.model.z, r.model.x, len(r.label)
-    N, m, labels = len(model.scale), len(belief.R), len(plant.labels)
+    N, m, labels = len(model.scale), r.R.shape[-1], len(plant.labels)
     assert model.lines is not None
     offset, direction = model.lines
     own = offset.shape[1] if plant.bare is None else len(plant.estimated)
@@ -123,26 +136,35 @@ def told_onset_bank(plant: Plant, belief: Belief, *, scenarios: Sequence[FaultSc
         changes, acts = label_changes(plant, scenarios, n)
         X, P = np.tile(model.X0, (n, count, 1)), np.tile(model.P0, (n, count, 1, 1))
         return Bank(
-            X, P, np.zeros((n, count)), changes, acts, np.zeros(n, bool), np.zeros((n, m)), np.tile(belief.R, (n, 1, 1)),
-            None if checks is None else checks.start(n),
+            X, P, np.zeros((n, count)), changes, acts, np.ones((n, 1)) if course is None else course, np.zeros(n, bool),
+            np.ones(n), np.zeros((n, m)), np.tile(r.R[0], (n, 1, 1)), None if checks is None else checks.start(n),
         )  # fmt: skip
+
+    def sized(share: Array) -> AugmentedModel:
+        """The model whose lines are as long as what acts is large."""
+        if (share == 1.0).all():
+            return model
+        wide = np.repeat(share, count)[:, None]
+        lines = (wide * np.tile(offset, (len(share), 1)), wide[..., None] * np.tile(direction, (len(share), 1, 1)))
+        return model.replace(lines=lines)
 
     def predict(s: Bank, at: Interval) -> Bank:
         n = len(at.k)
         each, k = np.arange(n), np.minimum(at.k, s.acts.shape[1] - 1)
         changed, now = s.changes[each, k], s.acts[each, k]
+        share = s.course[each, np.minimum(k, s.course.shape[1] - 1)]
         X, P, log = s.X.copy(), s.P.copy(), np.where(changed[:, None], 0.0, s.log)
         X[changed], P[changed] = X[changed, :1], P[changed, :1]
         X[..., z] = np.where(changed[:, None, None], r.m0, X[..., z])
         P[changed, :, z, :] = 0.0
         P[changed, :, :, z] = 0.0
         P[..., z, z] = np.where(changed[:, None, None, None], r.M0, P[..., z, z])
-        X1, P1 = model.predict("extended", X.reshape(-1, N), P.reshape(-1, N, N), at)
-        return s._replace(X=X1.reshape(n, count, N), P=P1.reshape(n, count, N, N), log=log, now=now)
+        X1, P1 = sized(share).predict("extended", X.reshape(-1, N), P.reshape(-1, N, N), at)
+        return s._replace(X=X1.reshape(n, count, N), P=P1.reshape(n, count, N, N), log=log, now=now, share=share)
 
     def update(s: Bank, at: Interval, y: Array, seen: Array) -> Bank:
         n = len(s.now)
-        done = model.update("extended", s.X.reshape(-1, N), s.P.reshape(-1, N, N), at, y, seen, r.R)
+        done = sized(s.share).update("extended", s.X.reshape(-1, N), s.P.reshape(-1, N, N), at, y, seen, r.R)
         found = s._replace(
             X=done.X.reshape(n, count, N), P=done.P.reshape(n, count, N, N), nu=done.nu.reshape(n, count, m)[:, 0],
             S=done.S.reshape(n, count, m, m)[:, 0], log=s.log + done.log_likelihood.reshape(n, count),
@@ -166,7 +188,7 @@ def told_onset_bank(plant: Plant, belief: Belief, *, scenarios: Sequence[FaultSc
         weight = np.exp(log - logsumexp(log[:, 1:], axis=1, keepdims=True)) * s.now[:, None]
         weight[:, 0] = 0.0
         deviation = offset + (direction @ s.X[..., z, None])[..., 0]
-        mean = (weight[..., None] * deviation).sum(axis=1)[:, :own]
+        mean = s.share[:, None] * (weight[..., None] * deviation).sum(axis=1)[:, :own]
         return Reading(mean, x=s.X[:, 0, x], nu=s.nu, S=s.S, probs=probs)
 
     rule = by_candidate(lambda reading, label: np.argmax(np.asarray(reading.probs), axis=1), 1)

@@ -101,9 +101,13 @@ def clock(t: Array, dt: float, what: str) -> Clock:
             raise RefusedError(f"{what}: {lost} of {len(t)} rows have no time")
         notes.append(f"{lost} rows without a time are left out")
     order = np.flatnonzero(there)
-    if np.any(np.diff(t[order]) < 0):
-        notes.append(f"rows are out of order at {int((np.diff(t[order]) < 0).sum())} places: sorted by time")
+    jumps = np.diff(t[order])
+    if np.any(jumps < 0):
+        back = int((-jumps > 0.5 * np.ptp(t[order])).sum())
         order = order[np.argsort(t[order], kind="stable")]
+        if back and (np.diff(t[order]) == 0).sum() > 0.1 * len(order):
+            raise RefusedError(f"{what}: its times begin again {back} times: it holds several flights; a file is one flight")
+        notes.append(f"rows are out of order at {int((jumps < 0).sum())} places: sorted by time")
     again = np.flatnonzero(np.diff(t[order]) == 0)
     if again.size:
         notes.append(f"{again.size} rows have the time of the one before: the last of each is used")
