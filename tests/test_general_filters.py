@@ -524,7 +524,9 @@ def test_builders_fly_nothing_and_say_why_they_cannot(monkeypatch, plant_id, nam
     assert (
         not reason
         or name in FAMILY
-        or re.search("no trained weights|no label of|no unknown-input observer|are allowed|too much", reason)
+        or re.search(
+            "no trained weights|no label of|no unknown-input observer|are allowed|too much|the three tanks only", reason
+        )
     ), reason
     with pytest.raises(ValueError, match="no such"):
         make_diagnoser(name, plant, process="no such", **({"scenarios": []} if entry.clairvoyant else {}))

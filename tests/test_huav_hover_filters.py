@@ -26,7 +26,7 @@ from fdi_gym.faults import FaultProcess, FaultScenario
 from fdi_gym.kernels import kernel
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
 from fdi_gym.plants import b747_lateral, huav_hover
-from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env
+from fdi_gym.testing import check_plant, check_streams, check_vector_env
 
 PAPER = {"b0_std": 2e-3, "d0_std": 0.5, "b_step": 7e-4, "d_step": 0.05, "x0_std": [*[0.1] * 3, *[0.02] * 6, *[0.005] * 2]}
 X0_STD = PAPER["x0_std"]
@@ -598,11 +598,6 @@ def test_plant_conforms(plant):
 @pytest.mark.parametrize("task", ["isolation", "identification"])
 def test_vector_environment_equals_single_ones(plant, task):
     check_vector_env(plant, n=3, steps=150, task=task)
-
-
-@pytest.mark.parametrize("name", ALL)
-def test_diagnoser_conforms(plant, name):
-    check_diagnoser(lambda plant, scenarios: build(name, plant, scenarios), plant, samples=120)
 
 
 GAPS = {

@@ -140,6 +140,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", str(place)], check=True)
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_an_error_that_loses_nothing(suite, whole, tmp_path, small_disk):
     failed_for_want_of_disk(start(suite, small_disk, tmp_path / "results"), "No space left on device")
     done = sorted(small_disk.rglob("block-*.json"))

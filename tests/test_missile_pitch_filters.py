@@ -24,7 +24,7 @@ from fdi_gym.estimation.decision import Reading
 from fdi_gym.estimation.interval import Interval
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plants import missile_pitch as missile
-from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env
+from fdi_gym.testing import check_plant, check_streams, check_vector_env
 
 FIVE = (1, 2, 3, 4, 5)
 NAMES = (
@@ -602,15 +602,6 @@ def test_detector_learns_and_tests_nothing_where_a_sensor_is_missing(plant):
     assert holed[k + 1].eps[0, 0] == 0.0
     assert holed[k + 1].eps[0, 1] == pytest.approx(without[k + 1].eps[0, 1], rel=0.05)
     assert (holed[k + 1].threshold >= without[k + 1].threshold).all()
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_conformance(plant, name):
-    check_diagnoser(lambda p, scenarios: make_diagnoser(name, p), plant, samples=250)
-
-
-def test_conformance_of_the_oracle(plant):
-    check_diagnoser(lambda p, scenarios: make_diagnoser("innovation_oracle", p, scenarios=scenarios), plant, samples=250)
 
 
 def test_oracle_reads_the_times_only(plant):

@@ -183,8 +183,10 @@ def test_curves_carry_bands_and_numbers(board):
     assert all("n " in text.get_text() for text in bands.axes[0].get_xticklabels())
 
 
-@pytest.mark.parametrize("kind", ["flight", "signals", "confusion", "delay", "severity", "ranking"])
-@pytest.mark.parametrize("suffix", ["png", "svg"])
+@pytest.mark.parametrize(
+    ("kind", "suffix"),
+    [*((kind, "svg") for kind in ("flight", "signals", "confusion", "delay", "severity", "ranking")), ("confusion", "png")],
+)
 def test_the_command_draws_every_kind(tmp_path, capsys, kind, suffix):
     target = tmp_path / f"x.{suffix}"
     methods = ["--methods", "windowed_nis"] if kind == "signals" else []
