@@ -103,9 +103,7 @@ def make_prober(name: str, plant: Plant, *, process: str = "standard", period: i
     return built
 
 
-def make_entrant(
-    suite: AnySuite, plant: Plant, name: str, scenarios: Sequence[Any] | None
-) -> tuple[Diagnoser, Prober]:
+def make_entrant(suite: AnySuite, plant: Plant, name: str, scenarios: Sequence[Any] | None) -> tuple[Diagnoser, Prober]:
     """An entrant's diagnoser and prober (`NEVER` for one that does not probe), with the settings of the suite.
 
     Raises:

@@ -157,7 +157,9 @@ def write_block(path: Path, block: Block, identity: str) -> None:
     write_whole(path, msgspec.json.encode(msgspec.structs.replace(block, sha256=block.content_sha256())))
 
 
-_flown: dict[tuple[Any, ...], tuple[Plant, Record | None]] = {}  # the last flights: methods are shown them one after the other
+_flown: dict[
+    tuple[Any, ...], tuple[Plant, Record | None]
+] = {}  # the last flights: methods are shown them one after the other
 
 
 def _fly(suite: AnySuite, episodes: range, plant_digest: str) -> tuple[Plant, Record | None]:

@@ -70,7 +70,7 @@ def overview() -> str:
     marked = {name: "*" if GROUPS["reference"](entry) else "" for name, entry in diagnosers().items()}
     lines += ["", 'Diagnosers (*: in the group "reference"; "all" is the group of all)']
     lines += [f"  {name:30s} {marked[name]:1s} {entry.summary}" for name, entry in diagnosers().items()]
-    lines += ["", "Probers (*: in the group \"reference\")"]
+    lines += ["", 'Probers (*: in the group "reference")']
     lines += [f"  {name:30s} {'*' if entry.reference else '':1s} {entry.summary}" for name, entry in probers().items()]
     lines += ["", "Trainers", *(f"  {name:32s} {found.summary}" for name, found in trainers().items())]
     if broken := broken_plugins():

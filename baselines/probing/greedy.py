@@ -16,7 +16,9 @@ from fdi_gym.diagnosis.contract import Diagnosis
 from fdi_gym.plant import Array, Plant
 
 
-@prober("greedy_probes_w10", "The probe with the largest expected information gain, at ten times its price", cost_weight=10.0)
+@prober(
+    "greedy_probes_w10", "The probe with the largest expected information gain, at ten times its price", cost_weight=10.0
+)
 @prober("greedy_probes_w3", "The same at three times its price", cost_weight=3.0)
 @prober("greedy_probes", "The probe with the largest expected information gain at its price", reference=True)
 @prober("greedy_probes_w0.3", "The same at three tenths of its price", cost_weight=0.3)

@@ -35,8 +35,6 @@ class Memory(NamedTuple):
 
 @prober("ppo_probes_w3", "PPO on belief, doubt and observation, at three times the cost", method="ppo_probes_w3")
 @prober("ppo_probes", "PPO on belief, doubt and observation", reference=True, method="ppo_probes")
-@prober("ppo_probes_discount_0", "The same that never looks ahead", method="ppo_probes_discount_0")
-@prober("recurrent_ppo_probes", "PPO with an LSTM on belief, doubt and observation", method="recurrent_ppo_probes")
 def ppo_probes(
     plant: Plant, *, process: str = "standard", period: int = 10, method: str = "ppo_probes", path: str = "", seed: int = 0
 ) -> Prober:  # fmt: skip
@@ -65,6 +63,18 @@ def ppo_probes(
     recurrent = card.shape.get("recurrent") is True
     weights.check_tensors(file, tensors, tensor_shapes(sight.width, sight.probes, hidden, recurrent))
     return policy(sight, {name: value.astype(float) for name, value in tensors.items()}, hidden, seed)
+
+
+@prober("ppo_probes_discount_0", "PPO that never looks ahead")
+def ppo_probes_discount_0(plant: Plant, *, process: str = "standard", period: int = 10) -> Prober:
+    """As `ppo_probes`, trained with a discount of 0."""
+    return ppo_probes(plant, process=process, period=period, method="ppo_probes_discount_0")
+
+
+@prober("recurrent_ppo_probes", "PPO with an LSTM on belief, doubt and observation")
+def recurrent_ppo_probes(plant: Plant, *, process: str = "standard", period: int = 10, path: str = "") -> Prober:
+    """As `ppo_probes`, with an LSTM."""
+    return ppo_probes(plant, process=process, period=period, method="recurrent_ppo_probes", path=path)
 
 
 def policy(sight: Sight, w: Mapping[str, Array], hidden: int, seed: int = 0) -> Prober:

@@ -224,7 +224,9 @@ def _register(
     rivals = ("diagnoser", "prober") if kind != "trainer" else ("trainer",)  # that are asked for in one place
     taken = next((_entries[rival][name] for rival in rivals if name in _entries[rival]), None)
     if taken is not None and (taken.build.__module__, taken.build.__qualname__) != (build.__module__, build.__qualname__):
-        raise ValueError(f"two {kind if kind == taken.kind else 'method'}s are called {name!r}: {taken.build.__module__} and {build.__module__}")
+        raise ValueError(
+            f"two {kind if kind == taken.kind else 'method'}s are called {name!r}: {taken.build.__module__} and {build.__module__}"
+        )
     allowed = inspect.signature(build).parameters
     for setting in settings:
         if setting not in allowed:
