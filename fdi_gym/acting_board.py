@@ -24,17 +24,18 @@ NEVER = "never"  # the family of those that don't probe
 WORSE = 1.05  # a flight is worse where it costs more than so many times what it costs with nothing
 
 PROBING = """An entrant is a diagnoser that never probes, or a prober with `{on_board}` on board that chooses a probe every
-{period} samples. Costs are the plant's flight cost per sample, tracking error and effort, and the cost of a prober is what the
-flights cost more than without a probe. Differences are paired, the same flights and the same noise, with 95 % intervals; the
-best that never probes is `{passive}`. "At this cost" compares a prober that looks with those that probe by the clock or by chance:
-their best mixture of the same mean cost. Delays run from the onset to the right label; longer ones than the median fault's length
-count as that.
+{period} samples. Costs are the plant's flight cost per sample, tracking error and effort; what a prober costs is what
+the flights cost more than without a probe. Differences are paired, the same flights and the same noise, with 95 %
+intervals; the best that never probes is `{passive}`. "At this cost" compares a prober that looks with those that
+probe by the clock or by chance: their best mixture of the same mean cost. Delays run from the onset to the right
+label; longer ones than the median fault's length count as that.
 """
-ACCOMMODATION = """Every {period} samples the controller is reconfigured for what the entrant says: `null` says nothing, `truth` is
-always right, `false_alarm` names one fault all the time. Costs are the plant's flight cost per sample. "Recovered" is the share of
-what the truth recovers of the cost, where it recovers more than chance; "averted" and "caused" are flights that leave their
-envelope with nothing and not with the entrant, and the reverse, in brackets those without a fault, which a false alarm has caused;
-"worse" is the share of faulty flights that cost 5 % more than with nothing. Intervals are 95 %, by resampled flights.
+ACCOMMODATION = """Every {period} samples the controller is reconfigured for what the entrant says: `null` says
+nothing, `truth` is always right, `false_alarm` names one fault all the time. Costs are the plant's flight cost per
+sample. "Recovered" is the share of what the truth recovers of the cost, where it recovers more than chance; "averted"
+and "caused" are flights that leave their envelope with nothing and not with the entrant, and the reverse, in brackets
+those without a fault, which a false alarm has caused; "worse" is the share of faulty flights that cost 5 % more than
+with nothing. Intervals are 95 %, by resampled flights.
 """
 
 
@@ -236,8 +237,8 @@ def verdict(acted: Acted) -> str:
     sure = all(drawn.difference(name, n)[1] > 0 for n in others) and all(gap[2] < 0 for gap in late.values())
     added = mean_interval(acted.cost(name) - acted.cost(passive.diagnoser))
     return (
-        f"The best chosen probing, `{name}`, has {said(gain, 1, 100.0)} points of accuracy per sample more than the best that "
-        f"never probes, and isolates {said(late[passive.diagnoser], 2)} s later, at a cost of {said(added)}: it "
+        f"The best chosen probing, `{name}`, has {said(gain, 1, 100.0)} points of accuracy per sample more than the best "
+        f"that never probes, and isolates {said(late[passive.diagnoser], 2)} s later, at a cost of {said(added)}: it "
         f"{'beats every entrant that never probes' if sure else 'does not beat every entrant that never probes'} in both."
     )
 

@@ -299,7 +299,8 @@ def _evaluated(
     outcomes = [episode for block in blocks for episode in block.outcomes]
     row = Row(
         suite=suite.name, suite_sha256=suite.sha256, diagnoser=name, settings=settings_of(suite, plant, name),
-        digests={"outcomes": outcomes_digest(outcomes), **digests}, packages=packages(find_entrant(suite, plant, name), plant),
+        digests={"outcomes": outcomes_digest(outcomes), **digests},
+        packages=packages(find_entrant(suite, plant, name), plant),
         metrics=summarise(outcomes, len(plant.labels), [s.name for s in plant.estimated], plant.dt),
     )  # fmt: skip
     time = 1e6 * sum(b.seconds for b in blocks) / sum(b.samples for b in blocks)

@@ -62,8 +62,8 @@ times per sample on the machine of the run, in blocks of 100 flights.
 
 ACTING = """## Where the diagnosis acts
 
-Suites of probing: the best prober that chooses and the best entrant that never probes, per sample %. Suites of accommodation:
-the share of what the truth recovers of the flights' cost, in percent. What could be known with and without probes:
+Suites of probing: the best prober that chooses and the best entrant that never probes, per sample %. Of accommodation: the
+share of what the truth recovers of the flights' cost, in percent. What could be known with and without probes:
 [bounds](acting-bounds.md).
 """
 

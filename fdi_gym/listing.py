@@ -63,7 +63,7 @@ def _ids() -> dict[str, str]:
 
 
 def overview() -> str:
-    """Names of all environments, suites, diagnosers, probers and trainers, with a line for each; what is broken is listed as such."""
+    """Names of all environments, suites and methods, with a line for each; what is broken is listed as such."""
     lines = ["Environments (the second of a plant where it declares how it can be acted on)"]
     lines += [f"  {name}-Faults-v{s.version} {name}-Active-v{s.version}" for name, s in plant_sources().items()]
     lines += ["", "Suites", *(f"  {name:32s} {_said(lambda n=name: load_suite(n).description)}" for name in suite_names())]
@@ -86,7 +86,7 @@ def _said(describe: Callable[[], str]) -> str:
 
 
 def details(text: str) -> str:
-    """Everything about a plant, an environment, a suite, a diagnoser, a prober or a trainer; a name may be more than one of these.
+    """Everything about a plant, an environment, a suite or a method; a name may be more than one of these.
 
     Raises:
         ValueError: Nothing is called so.

@@ -1,7 +1,8 @@
 """Suites: frozen JSON files that say which environment, which fault process and which seeds.
 
 A suite's content hash travels with every result. Suites of flights that are acted on (`ActingSuite`) and of recorded ones
-(`fdi_gym.recordings.suite`) are loaded by the same names. Packages bring theirs by the entry-point group "fdi_gym.suites": a package in whose folder the files are.
+(`fdi_gym.recordings.suite`) are loaded by the same names. Packages bring theirs by the entry-point group "fdi_gym.suites": a
+package in whose folder the files are.
 """
 
 from __future__ import annotations

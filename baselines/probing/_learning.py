@@ -1,9 +1,9 @@
 """PPO (stable-baselines3) that probes: the active environment with a diagnoser on board, in legs that can be resumed.
 
-The environment's action is the label that the diagnoser gives and the probe that the policy chooses; the reward of a decision
-is what the diagnosis is worth, less the weighted cost of the flight since the last one. A probe costs now and tells later: with
-a discount of 0 the policy learns never to probe, and the belief that a probe leaves behind is worth something only to one
-that looks ahead.
+The environment's action is the label that the diagnoser gives and the probe that the policy chooses; the reward of a
+decision is what the diagnosis is worth, less the weighted cost of the flight since the last one. A probe costs now and
+tells later: with a discount of 0 the policy learns never to probe, and the belief that a probe leaves behind is worth
+something only to one that looks ahead.
 """
 
 from __future__ import annotations

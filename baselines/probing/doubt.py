@@ -83,8 +83,8 @@ def divergences(plant: Plant, process: str, window: int) -> Array:
 
     Bases are flights without a fault, on which faults of each label are put; of two labels the mean over their faults.
     """
-    faults, label, onset = _examples(plant, process)
-    filtered = _steady(plant)
+    faults, label, onset = examples(plant, process)
+    filtered = steady(plant)
     assert plant.acting is not None
     found = []
     for seed in SEEDS[:BASES]:
@@ -100,7 +100,7 @@ def divergences(plant: Plant, process: str, window: int) -> Array:
             advance(flights, begins)
             acts.choose(np.full(len(flights), number))
             chunk = acts.advance(window)
-            nu = _innovations(plant, filtered, chunk.state[0], chunk.obs, begins)  # (window, flights, n_s), whitened
+            nu = innovations(plant, filtered, chunk.state[0], chunk.obs, begins)  # (window, flights, n_s), whitened
             D = 0.5 * ((nu[:, :, None] - nu[:, None]) ** 2).sum(axis=(0, 3))
             apart = np.zeros((len(plant.labels), len(plant.labels)))
             for i, j in itertools.permutations(np.unique(label), 2):
@@ -109,7 +109,7 @@ def divergences(plant: Plant, process: str, window: int) -> Array:
     return np.array(found)
 
 
-def _examples(plant: Plant, process: str) -> tuple[list[Any], Array, int]:
+def examples(plant: Plant, process: str) -> tuple[list[Any], Array, int]:
     """Faults of each label that the process draws, a few of each, their labels, and the sample where half have begun."""
     kept: dict[int, list[Any]] = {0: [[]]}
     onsets = []
@@ -126,7 +126,7 @@ def _examples(plant: Plant, process: str) -> tuple[list[Any], Array, int]:
     return [faults for some in kept.values() for faults in some], label, int(np.median(onsets))
 
 
-def _steady(plant: Plant) -> tuple[Array, Array, Array]:
+def steady(plant: Plant) -> tuple[Array, Array, Array]:
     """Of the plant linearised at trim: gain K (n_x, n_s), outputs with noise (n_s,), whitening L^-1 (n_s, n_s), S = L L'."""
     x, u = plant.trim_state, plant.trim_command
     h = 1e-5 * np.maximum([s.scale for s in plant.states], 1e-3)
@@ -140,7 +140,7 @@ def _steady(plant: Plant) -> tuple[Array, Array, Array]:
     return np.linalg.solve(S, C @ P).T, seen, np.linalg.inv(np.linalg.cholesky(S))
 
 
-def _innovations(plant: Plant, steady: tuple[Array, Array, Array], x: Array, obs: Array, first: int) -> Array:
+def innovations(plant: Plant, steady: tuple[Array, Array, Array], x: Array, obs: Array, first: int) -> Array:
     """The whitened innovations (K, n, n_s) of the healthy plant's filter from the states x (n, n_x) of a sample on."""
     K, seen, whiten = steady
     y, u, _ = plant.split(obs)

@@ -9,6 +9,8 @@ from baselines.learned.flights import Condition
 from baselines.learned.recipes import Recipe
 from fdi_gym.plant import NotApplicableError, Plant
 
+NO_MODEL = FeatureShape(stride=1, lags=0, degree=1)  # a prober sees what its diagnoser says
+
 
 @dataclass(frozen=True, kw_only=True)
 class ProbingRecipe(Recipe):
@@ -29,7 +31,7 @@ class ProbingRecipe(Recipe):
         entropy: Weight of the entropy.
     """
 
-    shape: FeatureShape = FeatureShape(stride=1, lags=0, degree=1)  # of no model
+    shape: FeatureShape = NO_MODEL
     identify: int = 0
     rate: float = 1e-3
     validate: int = 10

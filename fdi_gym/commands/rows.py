@@ -41,12 +41,13 @@ def evaluate(
     backend: Backend = "loky",
     cluster: Cluster = {},  # noqa: B006 (tyro reads the default)
 ) -> None:
-    """Run diagnosers, and probers on suites of probing, print the comparison table of each, and write one row per diagnoser and suite.
+    """Run diagnosers on suites, and probers on suites of probing, print the tables of each, and write their rows.
 
     Args:
         suites: Names of suites, or paths of suite files; "all" for every one that is here.
-        diagnosers: Names of diagnosers, and of probers where the suite is of probing; "reference" for those that others are compared with first, "all" for every one, of which those
-            run that can on the suite's plant; "module:function" for your own; "truth" where diagnoses are allowed for.
+        diagnosers: Names, where the suite is of probing of probers too; "reference" for those that others are compared with
+            first, "all" for every one, of which those run that can on the suite's plant; "module:function" for your own;
+            "truth" where diagnoses are allowed for.
         results: Folder for the rows, written as soon as a suite is finished; without it nothing but the tables is made.
         work: Folder of finished blocks. A killed run goes on from there.
         jobs: Worker processes, -1 for one per core.

@@ -1,4 +1,4 @@
-"""Diagnosers: the contract, the filters' contract, the guard, the registry (probers and trainers too), and what is fitted for them."""
+"""Diagnosers: the contract, the filters' contract, the guard, the registry of all methods, and what is fitted for them."""
 
 from fdi_gym.diagnosis.contract import Decisions, Diagnoser, Diagnosis, run
 from fdi_gym.diagnosis.filtering import Filter, diagnoser_of

@@ -13,8 +13,8 @@ A prober's builder makes one of a plant (`fdi_gym.agents.Prober`): what is added
     @prober("periodic_probes", "The plant's probes in turn")
     def periodic_probes(plant: Plant, *, on: int = 10, every: int = 30) -> Prober: ...
 
-A trainer makes weights for a diagnoser or a prober, in a folder of runs; it gives the path of the .safetensors file, whose card lies
-beside it:
+A trainer makes weights for a diagnoser or a prober, in a folder of runs; it gives the path of the .safetensors file, whose
+card lies beside it:
 
     @trainer("sequence_net", "Recurrent network, supervised")
     def train_sequence_net(plant: Plant, *, budget: int | None, seed: int, work: Path, threads: int) -> Path: ...
@@ -225,7 +225,8 @@ def _register(
     taken = next((_entries[rival][name] for rival in rivals if name in _entries[rival]), None)
     if taken is not None and (taken.build.__module__, taken.build.__qualname__) != (build.__module__, build.__qualname__):
         raise ValueError(
-            f"two {kind if kind == taken.kind else 'method'}s are called {name!r}: {taken.build.__module__} and {build.__module__}"
+            f"two {kind if kind == taken.kind else 'method'}s are called {name!r}: "
+            f"{taken.build.__module__} and {build.__module__}"
         )
     allowed = inspect.signature(build).parameters
     for setting in settings:
