@@ -9,12 +9,15 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import fdi_gym
-from baselines.probing import doubt
+from baselines.learned import weights
+from baselines.probing import doubt, ppo
+from baselines.probing._learning import ProbingTraining
 from baselines.probing.periodic import periodic_probes
+from baselines.probing.recipes import recipe_of
 from fdi_gym.acting import NO_PROBE, Acting, Probe, square
 from fdi_gym.acts import Acts, accommodated, acting_of, costs, probe_prices
 from fdi_gym.agents import NEVER, fly
-from fdi_gym.diagnosis import Diagnoser, Diagnosis, NotApplicableError, make_diagnoser, probers, run
+from fdi_gym.diagnosis import Diagnoser, Diagnosis, NotApplicableError, make_diagnoser, probers, run, trainers
 from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.engine import advance, simulate
 from fdi_gym.entrants import make_prober
@@ -485,42 +488,33 @@ def test_registering_a_plant_registers_its_active_environment():
 
 
 # ---------------------------------------------------------------------------------------------------------------
-# The page
+# Learned probers
+
+WEIGHTS = sorted(ppo.FOLDER.glob("*.safetensors"))
 
 
-def test_the_page_is_what_the_figures_say():
-    from benchmarks.acting import page
-    from benchmarks.acting.__main__ import BOARDS, measured
-    from benchmarks.acting.suites import ACCOMMODATION, ACTIVE
-
-    found = measured()
-    assert set(found) == {*ACTIVE, *ACCOMMODATION, "bounds"}
-    assert (BOARDS / "acting.md").read_text() == page.page(found, "leaderboards/acting")
-    for name in ACTIVE:
-        assert all((BOARDS / "pictures" / f"{name}{suffix}.png").is_file() for suffix in ("", "-flight"))
-
-
-def test_what_is_called_more_than_chance_is():
-    from benchmarks.acting import page
-    from benchmarks.acting.__main__ import measured
-
-    row = {"agent": "greedy", "prober": "greedy", "per_sample": [0.9, 0.8, 1.0], "cost": [0.1, 0.0, 0.2]}
-    for gain, late, words in (([0.1, 0.05, 0.15], [-2.0, -3.0, -1.0], "(more than chance)"),
-                              ([0.1, -0.05, 0.25], [-2.0, -5.0, 1.0], "no more than chance")):  # fmt: skip
-        said = page.verdict({"passive": "never", "rows": [row | {"per_sample_gain": gain, "delay_gain": late}]})
-        assert said.count(words) == 2
-    assert measured()
+@pytest.mark.parametrize("path", WEIGHTS, ids=lambda path: path.stem)
+def test_a_learned_prober_chooses_probes_and_one_that_does_not_look_ahead_never_pays(path):
+    card = weights.read_card(path)
+    plant, told = load_plant(card.plant, **card.options[0]), {"process": card.processes[0], "period": card.shape["period"]}
+    built = make_prober(card.method, plant, **told)
+    on_board = make_diagnoser(card.filters[0], plant, process=card.processes[0])
+    found = fly(plant, scenarios(plant, 4, "quiet", steps=600), on_board, built, period=card.shape["period"])
+    share = (found.probe > 0).mean()
+    assert (share < 0.01) if card.shape["discount"] == 0.0 else share > 0.01
+    with pytest.raises(NotApplicableError, match="trained for the process"):
+        make_prober(card.method, plant, process="gust", period=card.shape["period"])
+    assert trainers()[card.method].settings["method"] == card.method
 
 
-@pytest.mark.parametrize("variant", ["", "discount-0", "recurrent"])
-def test_a_learned_prober_chooses_probes_and_one_that_does_not_look_ahead_never_pays(variant):
-    from baselines.probing import ppo, recurrent_ppo
+def test_a_prober_is_trained_by_its_name_and_goes_on_where_it_was_killed(tmp_path):
+    recipe = recipe_of(load_plant("B747Lateral"), decisions=32, envs=4, steps=4, validate=1, validation=2, batch=8, epochs=1)
 
-    plant = load_plant("B747Lateral")
-    built = recurrent_ppo.prober(plant, process="quiet") if variant == "recurrent" else \
-        ppo.prober(plant, process="quiet", variant=variant)  # fmt: skip
-    bank = make_diagnoser("bayes_bank", plant, process="quiet")
-    found = fly(plant, scenarios(plant, 4, "quiet", steps=400), bank, built)
-    assert found.probe.any() == (variant != "discount-0")
-    with pytest.raises(ValueError, match="trained"):
-        ppo.prober(plant, process="gust")
+    def run(folder, **until):
+        return ProbingTraining("ppo_probes", load_plant("B747Lateral"), recipe, seed=0, work=folder).run(**until)
+
+    whole = run(tmp_path / "whole")
+    run(tmp_path / "killed", stop_after=1)
+    assert run(tmp_path / "killed").read_bytes() == whole.read_bytes()
+    built = make_prober("ppo_probes", load_plant("B747Lateral"), process="quiet", path=str(whole))
+    assert fly(load_plant("B747Lateral"), scenarios(load_plant("B747Lateral"), 1, steps=50), silent(None), built).probe.any()
