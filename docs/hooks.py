@@ -29,7 +29,7 @@ from sheets import data_sheet, methods, origins, plants, suite_sheet, suites
 from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.leaderboard import read_board
 from fdi_gym.report import report
-from fdi_gym.suite import load_suite, suite_names
+from fdi_gym.suite import ActingSuite, load_suite, suite_names
 
 BOARDS = ROOT / "leaderboards"
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)")
@@ -59,7 +59,7 @@ def on_config(config: Any) -> Any:
         "@suites": ["suites/index.md", *({name: f"suites/{name}.md"} for name in suite_names())],
         "@boards": ["boards/README.md", {"Grid of methods and plants": "boards/grid.md"},
                     {"Learned": "boards/learning/README.md"}, {"Coverage of the intervals": "boards/coverage.md"},
-                    {"Acting": "boards/acting.md"},
+                    {"Bounds with probes": "boards/acting-bounds.md"},
                     *({path.stem: f"boards/{path.name}"} for path in sorted(BOARDS.glob("*-*.md")))],
         "@reproduction": ["boards/reproduction/README.md",
                           *({path.stem: f"boards/reproduction/{path.name}"} for path in _reproduction())],
@@ -122,7 +122,7 @@ def _within(text: str, uri: str, known: set[str]) -> str:
 def _reports() -> Iterator[tuple[str, str]]:
     for name in suite_names():
         folder = BOARDS / "results" / name
-        if folder.is_dir():
+        if folder.is_dir() and not isinstance(load_suite(name), ActingSuite):
             yield (
                 f"reports/{name}.html",
                 report(read_board(folder, {name: load_suite(name)}), flights=FLIGHTS, progress=False),
