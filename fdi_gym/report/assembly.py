@@ -27,8 +27,8 @@ def report(board: Board, methods: Sequence[str] = (), flights: int = FLIGHTS, pr
         progress: Show a progress bar while methods run.
 
     Raises:
-        ValueError: The suite's flights are acted on, it has no rows, there are not so many flights, an unknown method, one that cannot run on the
-            plant, or more than fits into `LARGEST` bytes.
+        ValueError: The suite's flights are acted on, it has no rows, there are not so many flights, an unknown
+            method, one that cannot run on the plant, or more than fits into `LARGEST` bytes.
     """
     suite = board.suite
     if isinstance(suite, ActingSuite):
