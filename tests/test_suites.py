@@ -16,7 +16,7 @@ from fdi_gym.suite import Suite, chained, load_suite, suite_names
 
 SUITES = suite_names()
 DRAWN = [  # with every label of the plant
-    name for name in SUITES if not name.endswith("-paper") and not load_suite(name).process == "quiet"
+    name for name in SUITES if not name.endswith("-paper") and load_suite(name).process != "quiet"
 ]
 
 
