@@ -43,3 +43,27 @@ def random(plant: Plant) -> Diagnoser:
         return state, Diagnosis(mode > 0, mode, low + (high - low) * share[:, 1:], None, probs)
 
     return Diagnoser(lambda n: (), update)
+
+
+@diagnoser("false_alarm", "One fault all the time, from flight to flight another", sensors=True)
+def false_alarm(plant: Plant) -> Diagnoser:
+    """Names one fault of two thirds of its reach, whatever it sees: which one is a hash of the first sample.
+
+    Where diagnoses are allowed for, it shows what a false alarm does to a healthy flight.
+    """
+    estimates = np.tile(plant.healthy, (len(plant.labels), 1))
+    for i, label in enumerate(plant.labels):
+        for mode in plant.modes:
+            if mode.name in label.modes:
+                size = mode.reach[0] + 2 / 3 * (mode.reach[1] - mode.reach[0])
+                estimates[i] += np.array(mode.offset) + size * np.array(mode.direction)
+    count = max(len(plant.labels) - 1, 1)
+
+    def update(state: Array, obs: Array) -> tuple[Array, Diagnosis]:
+        bits = np.ascontiguousarray(np.nan_to_num(obs)).view(np.uint64).sum(axis=1, dtype=np.uint64)
+        with np.errstate(over="ignore"):
+            drawn = (bits * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(33)) % np.uint64(count)
+        label = np.where(state > 0, state, np.minimum(1 + drawn.astype(np.int64), len(plant.labels) - 1))
+        return label, Diagnosis(np.ones(len(obs), bool), label, estimates[label])
+
+    return Diagnoser(lambda n: np.zeros(n, np.int64), update, gaps=True)

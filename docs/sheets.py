@@ -13,7 +13,7 @@ from fdi_gym.design import DECISIONS, truths
 from fdi_gym.diagnosis.registry import GIVEN
 from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.plant import Plant
-from fdi_gym.suite import Suite, load_suite, suite_names
+from fdi_gym.suite import ActingSuite, Suite, load_suite, suite_names
 from fdi_gym.tables import markdown, plain
 
 BOARDS = Path(__file__).parent.parent / "leaderboards"
@@ -118,6 +118,8 @@ def suite_sheet(suite: Suite) -> str:
         ["seeds", f"{min(suite.seeds)} to {max([*suite.seeds, *suite.healthy])}, public; {suite.windows} a flight"],
         ["length", f"{min(steps) * plant.dt:g} to {max(steps) * plant.dt:g} s at {plant.dt:g} s; {sum(steps)} samples"],
         ["scored", f"from sample {process.scoring.start}, but for {process.scoring.grace} samples after a label's change"],
+        *([["acts", f"{suite.acts}, a decision every {suite.decision_period} samples"
+            + (f", `{suite.on_board}` on board" if suite.on_board else "")]] if isinstance(suite, ActingSuite) else []),
         ["tuning of its own", ", ".join(f"`{name}`" for name in suite.settings) or "none"],
         ["version", f"`{suite.sha256}`"], ["scenarios", f"`{suite.scenarios_sha256}`"],
         ["origin, licence", "simulated by this package, of the declaration of its plant; MIT, as the package; no persons"],

@@ -63,7 +63,7 @@ def fly(
         period: Decision period.
 
     Raises:
-        ValueError: Something that the plant does not declare.
+        ValueError: Something that the plant does not declare, or a prober that chooses what there is not.
     """
     if allow_for not in ALLOWING:
         raise ValueError(f"unknown allow_for {allow_for!r}; there are {', '.join(ALLOWING)}")
@@ -87,6 +87,7 @@ def fly(
             recording.keep(k, said)
         first += samples
         chooses, chosen = prober.choose(chooses, whole.obs[first - 1], said)
+        chosen = _checked(plant, chosen, n)
         if allow_for != "nothing":
             if allow_for == "truth":
                 label, theta = whole.label[first - 1], whole.theta[first - 1]
@@ -101,3 +102,17 @@ def fly(
     after = np.arange(longest + 1)[:, None]
     cost[(after > flights.length) & (after <= planned)] = acts.acting.lost
     return Flown(recorded(flights, whole), recording.decisions(), probe.T, cost.T, unusable)
+
+
+def _checked(plant: Plant, chosen: Any, n: int) -> Array:
+    """The probes (n,) that a prober has chosen.
+
+    Raises:
+        ValueError: They are not n numbers of probes.
+    """
+    names = [probe.name for probe in plant.acting.probes] if plant.acting else []
+    value = np.asarray(chosen)
+    if value.shape != (n,) or value.dtype.kind not in "iu" or not ((value >= 0) & (value < len(names))).all():
+        said = ", ".join(f"{i} {name}" for i, name in enumerate(names))
+        raise ValueError(f"a prober chooses whole numbers of the shape ({n},), of the probes {said}, not {chosen!r}")
+    return value.astype(np.int64)

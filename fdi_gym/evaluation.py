@@ -23,14 +23,15 @@ from fdi_gym.clusters import check_jobs, results
 from fdi_gym.compilation import compile_kernels
 from fdi_gym.diagnosis import NotApplicableError, find_diagnoser, make_diagnoser, run
 from fdi_gym.engine import Record
+from fdi_gym.entrants import find_entrant, fly_entrant, make_entrant, settings_of
 from fdi_gym.files import RefusedError, digest, read_json, sweep, write_whole
 from fdi_gym.metrics import Outcome, outcome
 from fdi_gym.names import blamed, file_name
 from fdi_gym.plant import Plant
-from fdi_gym.provenance import packages, provenance, sources
+from fdi_gym.provenance import made_of, packages, provenance, sources
 from fdi_gym.row import Evaluated, Made, Row, outcomes_digest
 from fdi_gym.scores import summarise
-from fdi_gym.suite import AnySuite
+from fdi_gym.suite import ActingSuite, AnySuite
 
 BLOCK = 100  # episodes flown and diagnosed together
 
@@ -63,22 +64,24 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), "fdi-gym": fdi_gym.__version__} | libraries
 
 
-def settings_of(suite: AnySuite, plant: Plant, name: str) -> dict[str, Any]:
-    """The tuning that a diagnoser's builder gets on a suite, in full: its paper's, the name's own, the suite's.
-
-    Raises:
-        ValueError: Unknown diagnoser or setting, or settings that JSON cannot say.
-    """
-    found = find_diagnoser(name).resolve(plant, **suite.settings.get(name, {}))
-    try:
-        return msgspec.json.decode(msgspec.json.encode(found))
-    except (TypeError, msgspec.MsgspecError) as error:
-        raise ValueError(f"{name}: its settings are not plain data: {error}") from error
-
-
 def digests_of(suite: AnySuite, plant: Plant, name: str) -> dict[str, str]:
-    """Digests of what makes a diagnoser's row on a suite, beside the suite; see `provenance`, which uses the method once."""
-    return provenance(name, plant, suite.process, settings_of(suite, plant, name))
+    """Digests of what makes an entrant's row on a suite, beside the suite; see `made_of`, which uses the method once.
+
+    What a prober has on board has a digest of its own: "on board".
+    """
+    settings = settings_of(suite, plant, name)
+    if not isinstance(suite, ActingSuite):
+        return provenance(name, plant, suite.process, settings)
+    entry = find_entrant(suite, plant, name)
+    few = msgspec.structs.replace(suite, seeds=suite.seeds[: suite.windows], healthy=[], steps=suite.decision_period)
+    found = made_of(
+        entry, plant, suite.process, settings, lambda: fly_entrant(few, plant, name, [0]), fly_entrant.__module__
+    )  # fmt: skip
+    if entry.kind == "prober":
+        its = suite.settings.get(suite.on_board, {})
+        board = provenance(suite.on_board, plant, suite.process, find_diagnoser(suite.on_board).resolve(plant, **its))
+        found["on board"] = digest({kind: sha256 for kind, sha256 in board.items() if kind not in ("plant", "engine")})
+    return found
 
 
 def diagnose(suite: AnySuite, plant: Plant, name: str, episodes: Sequence[int], record: Record | None = None) -> Block:
@@ -87,6 +90,17 @@ def diagnose(suite: AnySuite, plant: Plant, name: str, episodes: Sequence[int], 
     Raises:
         ValueError: The method's own code fails; `NotApplicableError` where it cannot run on this plant.
     """
+    scoring = plant.process(suite.process).scoring
+    if isinstance(suite, ActingSuite):
+        start = time.process_time()
+        flown = fly_entrant(suite, plant, name, episodes)
+        seconds = time.process_time() - start
+        outcomes = [
+            msgspec.structs.replace(outcome(plant, scoring, flown.record, flown.decisions, i), acted=flown.acted[i])
+            for i in range(len(episodes))
+        ]
+        return Block(outcomes, seconds, int((flown.record.length + 1).sum()))
+    find_entrant(suite, plant, name)  # or it says why not
     scenarios = suite.scenarios(plant, episodes)
     record = suite.record(plant, episodes) if record is None else record
     with blamed(name):
@@ -97,7 +111,6 @@ def diagnose(suite: AnySuite, plant: Plant, name: str, episodes: Sequence[int], 
         start = time.process_time()
         said = run(diagnoser, record.obs)
         seconds = time.process_time() - start
-    scoring = plant.process(suite.process).scoring
     outcomes = [outcome(plant, scoring, record, said, i) for i in range(len(episodes))]
     return Block(outcomes, seconds, int((record.length + 1).sum()))
 
@@ -113,7 +126,7 @@ def applicable(suite: AnySuite, plant: Plant, names: Sequence[str]) -> tuple[lis
     for name in names:
         try:
             with blamed(name):
-                make_diagnoser(name, plant, process=suite.process, scenarios=scenarios, **settings_of(suite, plant, name))
+                make_entrant(suite, plant, name, scenarios)
             able.append(name)
         except NotApplicableError as error:
             reasons[name] = str(error)
@@ -144,15 +157,18 @@ def write_block(path: Path, block: Block, identity: str) -> None:
     write_whole(path, msgspec.json.encode(msgspec.structs.replace(block, sha256=block.content_sha256())))
 
 
-_flown: dict[tuple[Any, ...], tuple[Plant, Record]] = {}  # the last flights: methods are shown them one after the other
+_flown: dict[
+    tuple[Any, ...], tuple[Plant, Record | None]
+] = {}  # the last flights: methods are shown them one after the other
 
 
-def _fly(suite: AnySuite, episodes: range, plant_digest: str) -> tuple[Plant, Record]:
+def _fly(suite: AnySuite, episodes: range, plant_digest: str) -> tuple[Plant, Record | None]:
+    """The plant, and the flights where nobody acts on them."""
     key = (suite.sha256, episodes, plant_digest)
     if key not in _flown:
         plant = suite.build()
         _flown.clear()
-        _flown[key] = plant, suite.record(plant, episodes)
+        _flown[key] = plant, None if isinstance(suite, ActingSuite) else suite.record(plant, episodes)
     return _flown[key]
 
 
@@ -264,7 +280,8 @@ def evaluate(
     plan = _Plan(suite, plant, list(dict.fromkeys(names)), work.resolve(), block)
     plan.folder.mkdir(parents=True, exist_ok=True)
     sweep(plan.folder)
-    compile_kernels(sources({__name__, *(find_diagnoser(name).build.__module__ for name in plan.names)}), jobs, progress)
+    makers = {find_entrant(suite, plant, name).build.__module__ for name in plan.names}
+    compile_kernels(sources({__name__, *makers}), jobs, progress)
     total = len(plan.names) * len(plan.ranges)
     with tqdm(total=total, desc=suite.name, unit="block", disable=not progress) as bar:
         for name, first, seconds in results(plan.tasks(bar), total, jobs):
@@ -282,7 +299,8 @@ def _evaluated(
     outcomes = [episode for block in blocks for episode in block.outcomes]
     row = Row(
         suite=suite.name, suite_sha256=suite.sha256, diagnoser=name, settings=settings_of(suite, plant, name),
-        digests={"outcomes": outcomes_digest(outcomes), **digests}, packages=packages(name, plant),
+        digests={"outcomes": outcomes_digest(outcomes), **digests},
+        packages=packages(find_entrant(suite, plant, name), plant),
         metrics=summarise(outcomes, len(plant.labels), [s.name for s in plant.estimated], plant.dt),
     )  # fmt: skip
     time = 1e6 * sum(b.seconds for b in blocks) / sum(b.samples for b in blocks)

@@ -108,3 +108,10 @@ def _resamples(stratum: tuple[int, ...], count: int, seed: int) -> Array:
         found[:, mine] = rng.multinomial(len(mine), np.full(len(mine), 1 / len(mine)), count)
     found.flags.writeable = False
     return found
+
+
+def mean_interval(values: Array) -> tuple[float, float, float]:
+    """The mean of one value per flight (N,), and its interval by Student's quantile; of one flight the mean alone."""
+    middle, n = float(np.mean(values)), len(values)
+    half = float(scipy.special.stdtrit(n - 1, 0.5 + CONFIDENCE / 2) * np.std(values, ddof=1) / np.sqrt(n)) if n > 1 else 0.0
+    return middle, middle - half, middle + half

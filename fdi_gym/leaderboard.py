@@ -7,12 +7,14 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
+from fdi_gym import acting_board
+from fdi_gym.acting_board import Acted
 from fdi_gym.comparison import Drawn, cliques, draw_again, tied_with_best
 from fdi_gym.files import RefusedError
 from fdi_gym.metrics import Outcome
 from fdi_gym.plant import Plant
 from fdi_gym.row import Row, read_made, read_outcomes, read_row, row_files
-from fdi_gym.suite import AnySuite, load_suite
+from fdi_gym.suite import ActingSuite, AnySuite, load_suite
 from fdi_gym.tables import (
     FLOOR,
     RANKINGS,
@@ -58,6 +60,13 @@ a paired bootstrap within labels with Holm's correction; "=" marks those that ca
 times per sample on the machine of the run, in blocks of 100 flights.
 """
 
+ACTING = """## Where the diagnosis acts
+
+Suites of probing: the best prober that chooses and the best entrant that never probes, per sample %. Of accommodation: the
+share of what the truth recovers of the flights' cost, in percent. What could be known with and without probes:
+[bounds](acting-bounds.md).
+"""
+
 
 class Board(NamedTuple):
     """All that is on a suite's page."""
@@ -75,6 +84,10 @@ class Board(NamedTuple):
     def drawn(self, rows: list[Row], kind: str = "per_sample") -> Drawn:
         """Their scores, on resamples of the flights."""
         return draw_again({row.diagnoser: self.outcomes[row.diagnoser] for row in rows}, len(self.plant.labels), kind)
+
+    def acted(self, suite: ActingSuite) -> Acted:
+        """The rows as those of a suite whose flights are acted on."""
+        return Acted(suite, self.plant, self.rows, self.outcomes)
 
     def best(self) -> Row | None:
         """The best row of a method that is told nothing."""
@@ -114,7 +127,9 @@ def read_board(folder: Path, suites: Mapping[str, AnySuite] = MappingProxyType({
 
 
 def tables(board: Board, columns: tuple[str, ...] = (), width: int | None = None) -> str:
-    """The three rankings; or with columns of one's choice one table, ranked by isolation."""
+    """The rankings, or how acting is compared; with columns of one's choice one table, ranked by isolation."""
+    if isinstance(board.suite, ActingSuite) and not columns:
+        return acting_board.tables(board.acted(board.suite), width)
     tied = tied_with_best(board.drawn(board.honest()))
     if columns:
         rows = RANKINGS["Isolation"][0](board.rows)
@@ -140,6 +155,8 @@ def page(board: Board) -> str:
     )
     if not board.rows:
         return f"{head}\nNo rows yet.\n"
+    if isinstance(suite, ActingSuite):
+        return f"{head}\n{acting_board.page(board.acted(suite))}"
     parts = [head, tables(board) + "\n"]
     best = board.best()
     if best is not None:
@@ -159,6 +176,9 @@ def draw(board: Board, folder: Path) -> None:
     """Draw the pictures of a suite's page into a folder: the ranking, and what the best row confuses."""
     from fdi_gym import plots
 
+    if isinstance(board.suite, ActingSuite):
+        acting_board.draw(board.acted(board.suite), folder)
+        return
     best = board.best()
     if best is None:
         return
@@ -188,20 +208,27 @@ def boards(results: Path, suites: Sequence[str] = ()) -> list[Board]:
 
 def front(found: list[Board]) -> str:
     """The page that leads to the others."""
-    lines = []
+    lines, acting = [], []
     for board in found:
+        link, size = f"[{board.suite.name}]({board.suite.name}.md)", str(board.suite.episodes)
+        if isinstance(board.suite, ActingSuite):
+            acting.append([link, size, str(len(board.rows)), acting_board.in_a_line(board.acted(board.suite))])
+            continue
         best, above = board.best(), max(
             (row.metrics["per_sample"]["balanced_accuracy"] for row in board.rows if ceiling(row)), default=None
         )  # fmt: skip
         score = best.metrics["per_sample"]["balanced_accuracy"] if best else None
         tied = len(tied_with_best(board.drawn(board.honest()))) if best else 0
         lines.append([
-            f"[{board.suite.name}]({board.suite.name}.md)", str(board.suite.episodes), str(len(board.rows)),
+            link, size, str(len(board.rows)),
             f"{plain(best.diagnoser)} {100 * score:.1f}" if best and score is not None else "-", str(max(tied - 1, 0)),
             "-" if above is None else f"{100 * above:.1f}",
         ])  # fmt: skip
     head = ["suite", "flights", "rows", "best, per sample %", "not told from it", "ceiling %"]
-    return f"{INTRODUCTION}\n{markdown(head, lines)}\n" if lines else INTRODUCTION
+    text = f"{INTRODUCTION}\n{markdown(head, lines)}\n" if lines else INTRODUCTION
+    if acting:
+        text += f"\n{ACTING}\n{markdown(['suite', 'flights', 'rows', 'the best'], acting)}\n"
+    return text
 
 
 def render(results: Path, suites: Sequence[str] = ()) -> dict[str, str]:

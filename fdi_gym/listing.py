@@ -12,8 +12,10 @@ from fdi_gym.diagnosis import (
     broken_plugins,
     diagnosers,
     find_diagnoser,
+    find_prober,
     find_trainer,
     make_diagnoser,
+    probers,
     trainers,
 )  # fmt: skip
 from fdi_gym.diagnosis.registry import GIVEN, GROUPS
@@ -21,7 +23,7 @@ from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.faults import draw
 from fdi_gym.names import blamed, find_module, unknown
 from fdi_gym.recordings.suite import RecordedSuite
-from fdi_gym.suite import AnySuite, load_suite, suite_names
+from fdi_gym.suite import ActingSuite, AnySuite, load_suite, suite_names
 
 
 def find_plant(text: str) -> tuple[str, str]:
@@ -61,13 +63,15 @@ def _ids() -> dict[str, str]:
 
 
 def overview() -> str:
-    """Names of all environments, suites, diagnosers and trainers, with a line for each; what is broken is listed as such."""
+    """Names of all environments, suites and methods, with a line for each; what is broken is listed as such."""
     lines = ["Environments (the second of a plant where it declares how it can be acted on)"]
     lines += [f"  {name}-Faults-v{s.version} {name}-Active-v{s.version}" for name, s in plant_sources().items()]
     lines += ["", "Suites", *(f"  {name:32s} {_said(lambda n=name: load_suite(n).description)}" for name in suite_names())]
     marked = {name: "*" if GROUPS["reference"](entry) else "" for name, entry in diagnosers().items()}
     lines += ["", 'Diagnosers (*: in the group "reference"; "all" is the group of all)']
     lines += [f"  {name:30s} {marked[name]:1s} {entry.summary}" for name, entry in diagnosers().items()]
+    lines += ["", 'Probers (*: in the group "reference")']
+    lines += [f"  {name:30s} {'*' if entry.reference else '':1s} {entry.summary}" for name, entry in probers().items()]
     lines += ["", "Trainers", *(f"  {name:32s} {found.summary}" for name, found in trainers().items())]
     if broken := broken_plugins():
         lines += ["", "Broken plug-ins", *(f"  {name:32s} {reason}" for name, reason in broken.items())]
@@ -82,7 +86,7 @@ def _said(describe: Callable[[], str]) -> str:
 
 
 def details(text: str) -> str:
-    """Everything about a plant, an environment, a suite, a diagnoser or a trainer; a name may be more than one of these.
+    """Everything about a plant, an environment, a suite or a method; a name may be more than one of these.
 
     Raises:
         ValueError: Nothing is called so.
@@ -98,22 +102,26 @@ def details(text: str) -> str:
         found.append(_suite(load_suite(text)))
     if text in diagnosers():
         found.append(_diagnoser(find_diagnoser(text)))
+    if text in probers():
+        found.append(_prober(find_prober(text)))
     if text in trainers():
         found.append(_trainer(find_trainer(text)))
     if not found:
-        everything = [*sorted(ids), *suite_names(), *diagnosers(), *trainers()]
+        everything = [*sorted(ids), *suite_names(), *diagnosers(), *probers(), *trainers()]
         near = " or ".join(difflib.get_close_matches(text, everything, 3))
         raise ValueError(f"nothing is called {text!r}; {f'did you mean {near}? ' if near else ''}'fdi-gym list' names all")
     return "\n\n".join(found)
 
 
 def _outside(text: str, name: str) -> str:
-    """What "module:name" names: a plant that the module registers, or else a trainer or a builder in it."""
+    """What "module:name" names: a plant that the module registers, or else a trainer, a prober or a builder in it."""
     function = getattr(find_module(text.rpartition(":")[0]), name, None)
     if name in _ids():
         return load_plant(find_plant(text)[1]).describe()
     if any(entry.build is function for entry in trainers().values()):
         return _trainer(find_trainer(text))
+    if any(entry.build is function for entry in probers().values()):
+        return _prober(find_prober(text))
     return _diagnoser(find_diagnoser(text))
 
 
@@ -125,12 +133,19 @@ def _suite(suite: AnySuite) -> str:
     lines += [f"  process      {suite.process}", f"  mismatch     {suite.mismatch}"]
     seeds = [*suite.seeds, *suite.healthy]
     lines += [f"  flights      {suite.episodes}, of seeds between {min(seeds)} and {max(seeds)}"]
+    if isinstance(suite, ActingSuite):
+        lines += [f"  acts         {suite.acts}, a decision every {suite.decision_period} samples"]
+        lines += [f"  on board     {suite.on_board}"] if suite.on_board else []
     lines += [f"  settings of {name}: {settings}" for name, settings in suite.settings.items()]
     return "\n".join([*lines, f"  version      {suite.sha256[:12]}", "", f"  fdi-gym evaluate {suite.name}"])
 
 
 def _diagnoser(entry: Entry) -> str:
     return "\n".join([*_settings(entry), "", "plants, as they are by default", *_plants(entry)])
+
+
+def _prober(entry: Entry) -> str:
+    return "\n".join([*_settings(entry), "", f"  fdi-gym evaluate SUITE --diagnosers {entry.name}, on a suite of probing"])
 
 
 def _trainer(entry: Entry) -> str:

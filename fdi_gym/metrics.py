@@ -79,6 +79,14 @@ class Declaration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     found: list[Found]  # of the modes that are both
 
 
+class Acted(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What acting came to on a flight."""
+
+    cost: float  # flight cost, mean over the samples for which the flight was planned
+    probed: Count  # samples under a probe
+    unusable: Count  # diagnoses that were to be allowed for and were not numbers
+
+
 class Outcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One episode, reduced to counts."""
 
@@ -99,6 +107,7 @@ class Outcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     declaration: Declaration
     stated: list[Stated] | None  # per estimated entry, where the method states deviations
     log_score: float | None  # sum of log probabilities of the true label over scored samples, where there are any
+    acted: Acted | msgspec.UnsetType = msgspec.UNSET  # where the diagnosis acts
 
 
 def check_outcomes(outcomes: Sequence[Outcome], labels: int, entries: int) -> None:
@@ -141,6 +150,8 @@ def check_outcomes(outcomes: Sequence[Outcome], labels: int, entries: int) -> No
                                                     or (o.labelled and o.isolation is not None) for o in episode.onsets),
             "sums of squares that no error has": any(not 0 <= value < 1e300 for value in sums),
             "a declaration that cannot be": not _possible(episode.declaration, episode.steps),
+            "acts that no flight can have": episode.acted is not msgspec.UNSET
+            and not (0 <= episode.acted.cost < 1e12 and max(episode.acted.probed, episode.acted.unusable) <= episode.steps),
             "a log score above 0": episode.log_score is not None and not -1e300 < episode.log_score <= 1e-6,
         }  # fmt: skip
         for what, is_so in wrong.items():

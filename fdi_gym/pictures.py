@@ -11,7 +11,7 @@ from fdi_gym.comparison import cliques
 from fdi_gym.curves import delay_curve, severity_curve
 from fdi_gym.diagnosis import Decisions, make_diagnoser, run
 from fdi_gym.engine import Record
-from fdi_gym.evaluation import settings_of
+from fdi_gym.entrants import settings_of
 from fdi_gym.leaderboard import Board, framing, read_board
 from fdi_gym.metrics import BANDS
 from fdi_gym.names import blamed, unknown

@@ -24,7 +24,7 @@ import numpy as np
 import platformdirs
 
 import fdi_gym
-from fdi_gym.diagnosis import diagnosers, find_diagnoser, make_diagnoser
+from fdi_gym.diagnosis import Entry, diagnosers, find_diagnoser, make_diagnoser
 from fdi_gym.diagnosis.knowledge import knowledge_of
 from fdi_gym.diagnosis.registry import package_of
 from fdi_gym.discovery import load_plant, plant_sources
@@ -42,13 +42,24 @@ _CHOOSERS = {"make_diagnoser", "find_diagnoser"}  # a method that calls one depe
 
 
 def provenance(name: str, plant: Plant, process: str, settings: Mapping[str, Any]) -> dict[str, str]:
-    """Digests of all that a diagnoser's results on a plant depend on, beside the suite: one per kind.
+    """Digests of all that a diagnoser's results on a plant depend on, beside the suite: see `made_of`."""
+    return made_of(
+        find_diagnoser(name), plant, process, settings, lambda: _use(name, plant, process, settings)
+    )  # fmt: skip
+
+
+def made_of(
+    entry: Entry, plant: Plant, process: str, settings: Mapping[str, Any], use: Callable[[], Any], flown: str = ""
+) -> dict[str, str]:
+    """Digests of all that a method's results on a plant depend on, beside the suite: one per kind.
 
     Args:
-        name: The diagnoser.
+        entry: The diagnoser or prober.
         plant: The plant.
         process: The fault process that it meets.
         settings: What its builder gets.
+        use: Builds the method and uses it once: whatever it reads, compiles or calibrates is read, compiled, calibrated.
+        flown: The module that flies, where the method acts on its flights.
 
     Returns:
         SHA-256 of "method", "plant" and "engine" (their modules), of "belief" and "calibration" where the method takes
@@ -57,13 +68,12 @@ def provenance(name: str, plant: Plant, process: str, settings: Mapping[str, Any
     Raises:
         ValueError: The method cannot be built; `NotApplicableError` where it cannot run on this plant.
     """
-    entry = find_diagnoser(name)
-    build: Any = entry.build
+    build, name = entry.build, entry.name
     method = sources({build.__module__, name.partition(":")[0] if ":" in name else build.__module__})
     declared = sources({plant_sources()[plant.id].builder.partition(":")[0]}) if plant.id in plant_sources() else {}
-    engine = sources({simulate.__module__, outcome.__module__})
+    engine = sources({simulate.__module__, outcome.__module__, *([flown] if flown else [])})
     key = (name, plant.env_id, repr(sorted(plant.options.items())), repr(sorted(settings.items())))
-    read = _while_running(key, lambda: _use(name, plant, process, settings))
+    read = _while_running(key, lambda: (_load(plant), use()))
     own = {**method, **declared}
     read |= {path for file in own.values() for path in _at_import.get(str(file), ())}
     home = package_of(entry)
@@ -74,14 +84,14 @@ def provenance(name: str, plant: Plant, process: str, settings: Mapping[str, Any
     return found | ({"data": _digest({str(p): p for p in data}, by_name=False)} if data else {})
 
 
-def packages(name: str, plant: Plant) -> dict[str, str]:
-    """The packages of a diagnoser, its plant and the engine, as "name version": one per kind.
+def packages(entry: Entry, plant: Plant) -> dict[str, str]:
+    """The packages of a method, its plant and the engine, as "name version": one per kind.
 
     Modules that no installed package brings, such as one in the current folder, have none.
     """
     source = plant_sources().get(plant.id)
     modules = {
-        "method": find_diagnoser(name).build.__module__,
+        "method": entry.build.__module__,
         "plant": source.builder if source else "",
         "engine": "fdi_gym",
     }
@@ -115,10 +125,14 @@ def _package(module: str) -> str:
         return ""
 
 
-def _use(name: str, plant: Plant, process: str, settings: Mapping[str, Any]) -> None:
-    """Build a method and show it one sample: whatever it reads, compiles or calibrates is read, compiled, calibrated."""
+def _load(plant: Plant) -> None:
+    """Build a plant again, for what its builder reads."""
     if plant.id in plant_sources():
-        load_plant(plant.id, **plant.options)  # for what its builder reads
+        load_plant(plant.id, **plant.options)
+
+
+def _use(name: str, plant: Plant, process: str, settings: Mapping[str, Any]) -> None:
+    """Build a diagnoser and show it one sample."""
     scenarios, obs = None, np.array([[s.nominal for s in plant.observed]])
     if plant.kernels is not None:
         scenarios = [draw(plant.process(process), 0)]

@@ -25,13 +25,14 @@ from msgspec import Meta
 
 from fdi_gym.comparison import holm
 from fdi_gym.design import DECISIONS, by_label
+from fdi_gym.diagnosis import find_diagnoser
 from fdi_gym.evaluation import digests_of, evaluate
 from fdi_gym.files import RefusedError, decode, pretty, read_bytes, read_json, write_whole
 from fdi_gym.intervals import CONFIDENCE
 from fdi_gym.names import check_name, in_a_line
 from fdi_gym.provenance import packages
 from fdi_gym.row import Row, read_outcomes, read_row, row_files, write_rows
-from fdi_gym.suite import LARGEST, Suite, freeze, load_suite, suite_names
+from fdi_gym.suite import LARGEST, ActingSuite, Suite, freeze, load_suite, suite_names
 from fdi_gym.tables import isolates, markdown, plain
 from fdi_gym.verification import check_made_by, check_row, check_settings, check_trusted
 
@@ -96,6 +97,8 @@ def seal(round: str, public: Suite, folder: Path, decisions: int = DECISIONS, ep
     check_name("round", round)
     if not isinstance(public, Suite):
         raise ValueError(f"{public.name} holds recorded flights: nobody can draw others")
+    if isinstance(public, ActingSuite):
+        raise ValueError(f"{public.name} is of flights that are acted on: rounds are sealed of those that are shown to all")
     published, kept = folder / f"{round}.sealed.json", folder / f"{round}.secret.json"
     for path in (published, kept):
         if path.exists():
@@ -193,7 +196,7 @@ def reveal(
             check_trusted(row, path, trust)
             check_row(row, read_outcomes(path, row, plant), public, plant)
             check_settings(row, public, plant)
-            check_made_by(row, digests_of(public, plant, row.diagnoser), packages(row.diagnoser, plant))
+            check_made_by(row, digests_of(public, plant, row.diagnoser), packages(find_diagnoser(row.diagnoser), plant))
             found[row.diagnoser] = path, row
         except (ValueError, OSError) as error:
             refused[path] = in_a_line(error)

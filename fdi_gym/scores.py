@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import msgspec
 import numpy as np
 
-from fdi_gym.intervals import balanced_interval, recalls, resamples, strata
-from fdi_gym.metrics import BANDS, PHASES, Onset, Outcome
+from fdi_gym.intervals import balanced_interval, mean_interval, recalls, resamples, strata
+from fdi_gym.metrics import BANDS, PHASES, Acted, Onset, Outcome
 from fdi_gym.plant import Array
 
 BOOTSTRAP = 1000
@@ -181,6 +182,25 @@ def _scenario(outcomes: Sequence[Outcome], dt: float) -> dict[str, Any]:
     }
 
 
+def acted_of(outcomes: Sequence[Outcome]) -> list[Acted]:
+    """What acting came to on each flight; none where the diagnosis does not act."""
+    return [flight.acted for flight in outcomes if flight.acted is not msgspec.UNSET]
+
+
+def costs(outcomes: Sequence[Outcome]) -> Array:
+    """The flight cost of each flight (N,), where the diagnosis acts."""
+    return np.array([one.cost for one in acted_of(outcomes)])
+
+
+def _acting(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    acted, steps = acted_of(outcomes), sum(flight.steps for flight in outcomes)
+    middle, low, high = mean_interval(costs(outcomes))
+    return {
+        "cost": middle, "cost_interval": [low, high], "probed": sum(one.probed for one in acted) / steps,
+        "unusable": sum(one.unusable for one in acted),
+    }  # fmt: skip
+
+
 def summarise(outcomes: Sequence[Outcome], labels: int, entries: Sequence[str], dt: float) -> dict[str, Any]:
     """The scores of a set of flights, from their outcomes alone.
 
@@ -193,6 +213,9 @@ def summarise(outcomes: Sequence[Outcome], labels: int, entries: Sequence[str], 
 
     The scenario task is scored on what the labels and estimates amount to as one declaration of each flight
     (`fdi_gym.declaration`).
+
+    Where the diagnosis acts there is what it cost ("acting"): the mean flight cost with its interval, and the share of the
+    samples under a probe.
 
     Args:
         outcomes: One per flight.
@@ -225,4 +248,5 @@ def summarise(outcomes: Sequence[Outcome], labels: int, entries: Sequence[str], 
         "log_score": float(sum(s for s, _ in scored) / samples) if samples else None,
         "lost_episodes": sum(flight.lost for flight in outcomes),
         "terminated_episodes": sum(flight.terminated for flight in outcomes),
+        **({"acting": _acting(outcomes)} if acted_of(outcomes) else {}),
     }

@@ -1,7 +1,8 @@
 """Suites: frozen JSON files that say which environment, which fault process and which seeds.
 
-A suite's content hash travels with every result. Suites of recorded flights (`fdi_gym.recordings.suite`) are loaded by the
-same names. Packages bring theirs by the entry-point group "fdi_gym.suites": a package in whose folder the files are.
+A suite's content hash travels with every result. Suites of flights that are acted on (`ActingSuite`) and of recorded ones
+(`fdi_gym.recordings.suite`) are loaded by the same names. Packages bring theirs by the entry-point group "fdi_gym.suites": a
+package in whose folder the files are.
 """
 
 from __future__ import annotations
@@ -12,12 +13,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, Literal, get_type_hints
 
 import msgspec
 import numpy as np
 
-from fdi_gym.diagnosis import find_diagnoser
+from fdi_gym.acts import acting_of
+from fdi_gym.diagnosis import find_diagnoser, probers
 from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.engine import Record, simulate
 from fdi_gym.faults import MAX_STEPS, FaultScenario, draw
@@ -242,6 +244,54 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise ValueError(f"{self.name}: this version draws other scenarios than the suite was frozen with")
 
 
+class ActingSuite(Suite, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is run where the diagnosis acts: flights as in `Suite`, that answer to who is on board.
+
+    Args:
+        acts: "probing": probers enter, with the suite's diagnoser on board, and diagnosers that never probe.
+            "accommodation": diagnosers enter, and the controller is reconfigured for what they say.
+        decision_period: Samples from one decision to the next.
+        on_board: The diagnoser that probers have on board; "" for accommodation.
+
+    Raises:
+        ValueError: As for `Suite`; nobody on board, or somebody where nobody can be.
+    """
+
+    acts: Literal["probing", "accommodation"]
+    decision_period: int
+    on_board: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= self.decision_period <= MAX_STEPS:
+            raise ValueError(f"decision_period is from 1 to {MAX_STEPS}, not {self.decision_period}")
+        if self.acts == "probing":
+            check_diagnoser_name(self.on_board)
+        elif self.on_board:
+            raise ValueError(f"for accommodation whoever enters is on board, not {self.on_board!r} too")
+
+    def build(self) -> Plant:
+        """As `Suite.build`.
+
+        Raises:
+            ValueError: As there; the plant does not declare how it can be acted on so.
+        """
+        plant = super().build()
+        acting_of(plant, self.acts == "probing", self.acts == "accommodation")
+        return plant
+
+    def record(self, plant: Plant, episodes: Sequence[int]) -> Record:
+        """Nobody can fly them without who acts.
+
+        Raises:
+            ValueError: Always.
+        """
+        raise ValueError(
+            f"the flights of {self.name} answer to who acts on them; for what is flown once and shown to all, take a suite "
+            "that does not act"
+        )
+
+
 AnySuite = Suite | RecordedSuite
 
 
@@ -289,9 +339,10 @@ def load_suite(name: str) -> AnySuite:
         raise unknown("suite", name, sorted(known))
     else:
         path = known[name]
-    if "flights" in read_json(path, dict[str, msgspec.Raw], "suite"):
+    said = read_json(path, dict[str, msgspec.Raw], "suite")
+    if "flights" in said:
         return read_recorded(path)
-    suite = read_json(path, Suite, "suite", LARGEST)
+    suite = read_json(path, ActingSuite if "acts" in said else Suite, "suite", LARGEST)
     if suite.name != path.stem:
         raise RefusedError(f"{path} holds a suite that is called {suite.name}")
     if suite.sha256 != suite.content_sha256():
@@ -307,14 +358,17 @@ def freeze(suite: Suite, folder: Path = SUITES) -> Path:
     Raises:
         ValueError: A suite of that name and another content exists, or settings are of no diagnoser or not its own.
     """
+    if isinstance(suite, ActingSuite) and suite.on_board:
+        find_diagnoser(suite.on_board)
     for name, settings in suite.settings.items():
-        allowed = inspect.signature(find_diagnoser(name).build).parameters
+        entry = probers().get(name) or find_diagnoser(name)
+        allowed = inspect.signature(entry.build).parameters
         for key in settings:
             if key not in allowed:
                 raise unknown(f"setting of {name}", key, list(allowed)[1:])
     suite = suite.sealed()
     path = folder / f"{suite.name}.json"
-    if path.exists() and read_json(path, Suite, "suite", LARGEST).sha256 != suite.sha256:
+    if path.exists() and load_suite(str(path)).sha256 != suite.sha256:
         raise ValueError(f"{path} is frozen with another content; choose another name")
     write_whole(path, pretty(suite))
     return path

@@ -19,8 +19,9 @@ import msgspec
 import numpy as np
 
 from fdi_gym.clusters import check_jobs
-from fdi_gym.diagnosis import diagnosers
-from fdi_gym.evaluation import diagnose, digests_of, settings_of
+from fdi_gym.diagnosis import diagnosers, probers
+from fdi_gym.entrants import TRUTH, find_entrant, settings_of
+from fdi_gym.evaluation import diagnose, digests_of
 from fdi_gym.files import RefusedError, pretty, write_whole
 from fdi_gym.metrics import Outcome
 from fdi_gym.names import unknown
@@ -126,8 +127,9 @@ def check_trusted(row: Row, path: Path, trust: Collection[str]) -> None:
         raise RefusedError(
             f"{path}: {row.diagnoser} is code outside the package; look at it, then once more with --trust {row.diagnoser}"
         )
-    if ":" not in row.diagnoser and row.diagnoser not in diagnosers():
-        raise RefusedError(f"{path}: {unknown('diagnoser', row.diagnoser, diagnosers())}")
+    known = [*diagnosers(), *probers(), TRUTH.name]
+    if ":" not in row.diagnoser and row.diagnoser not in known:
+        raise RefusedError(f"{path}: {unknown('diagnoser', row.diagnoser, known)}")
 
 
 def check_drawing(share: float, seed: int | None) -> None:
@@ -174,7 +176,7 @@ def verify(
     outcomes = read_outcomes(path, row, plant)
     check_row(row, outcomes, frozen, plant)
     check_settings(row, frozen, plant)
-    digests, brought = digests_of(frozen, plant, row.diagnoser), packages(row.diagnoser, plant)
+    digests, brought = digests_of(frozen, plant, row.diagnoser), packages(find_entrant(frozen, plant, row.diagnoser), plant)
     if not renew:
         check_made_by(row, digests, brought)
     rng = np.random.default_rng(seed)

@@ -24,9 +24,11 @@ from baselines.learned.flights import CALIBRATION, TEST, TRAINING, VALIDATION, C
 from baselines.learned.recipes import SequenceRecipe
 from fdi_gym.diagnosis import (
     NotApplicableError,
+    diagnosers,
     find_diagnoser,
     find_trainer,
     make_diagnoser,
+    probers,
     registry,
     run,
     train,
@@ -254,7 +256,8 @@ def test_a_run_leaves_a_card_and_a_log(tiny):
 
 
 def test_every_learned_method_has_a_trainer_of_its_name():
-    assert {*LEARNED, *CLOSED_FORM} == set(trainers())
+    assert {*LEARNED, *CLOSED_FORM} == set(trainers()) - set(probers())
+    assert set(trainers()) <= {*diagnosers(), *probers()}
     with pytest.raises(ValueError, match=r"unknown trainer 'sequence_nett'; did you mean sequence_net\?"):
         find_trainer("sequence_nett")
     with pytest.raises(ValueError, match="two trainers are called 'ppo'"):

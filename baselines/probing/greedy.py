@@ -1,40 +1,28 @@
 """Greedy information gain: the probe that is worth most, by what is believed and by what each probe would tell.
 
-Hypotheses i and j, under a probe, differ in the innovations nu of the healthy plant's Kalman filter, with covariance S.
-In so many samples they can be told apart by the Kullback-Leibler divergence
-
-    D_ij = sum_k |nu_i,k - nu_j,k|^2_{S^-1} / 2
-
-which is measured on flights without noise, of faults drawn from the process. An error between i and j, of which one is
-true with the believed probabilities p_i and p_j, is resolved with the probability 1 - exp(-D_ij), and a fault that is
-found pays for so many decisions to come. What that is worth more than without a probe is set against the price.
-
-What is believed is what the diagnoser says, and doubt: at every decision a fault may have begun that has not been seen,
-and what has been probed since is known better, by the same 1 - exp(-D_ij).
+What a decision under each probe resolves (`baselines.probing.doubt`), more than without, pays for so many decisions to
+come; that is set against the probe's price.
 """
 
 from __future__ import annotations
 
-import itertools
-from typing import Any
-
-import msgspec
 import numpy as np
-import scipy.linalg
 
-from fdi_gym.acts import Acts, probe_prices
+from baselines.probing.doubt import Doubt
+from fdi_gym.acts import probe_prices
 from fdi_gym.agents import Prober
+from fdi_gym.diagnosis import prober
 from fdi_gym.diagnosis.contract import Diagnosis
-from fdi_gym.engine import advance, no_noise
-from fdi_gym.faults import draw
-from fdi_gym.flights import Flights
 from fdi_gym.plant import Array, Plant
 
-SEEDS = range(2_000_000, 2_002_000)  # of the faults that the hypotheses stand for
-EXAMPLES, BASES = 3, 3  # faults of each label, flights that they are put on
 
-
-def prober(
+@prober(
+    "greedy_probes_w10", "The probe with the largest expected information gain, at ten times its price", cost_weight=10.0
+)
+@prober("greedy_probes_w3", "The same at three times its price", cost_weight=3.0)
+@prober("greedy_probes", "The probe with the largest expected information gain at its price", reference=True)
+@prober("greedy_probes_w0.3", "The same at three tenths of its price", cost_weight=0.3)
+def greedy_probes(
     plant: Plant, *, process: str = "standard", period: int = 10, pays_for: float = 30.0, cost_weight: float = 1.0,
     window: int = 400,
 ) -> Prober:  # fmt: skip
@@ -42,106 +30,17 @@ def prober(
 
     Args:
         plant: The plant.
-        process: The fault process that is met; how often its faults begin is the hazard.
+        process: The fault process that is met.
         period: Decision period [samples].
         pays_for: Decisions for which a fault that is told from another pays.
         cost_weight: Factor on the price of a probe.
         window: Samples over which hypotheses are told apart by a probe that goes on.
     """
-    gains = (1.0 - np.exp(-divergences(plant, process, window) * period / window)).mean(axis=0)  # (probes, labels, labels)
-    price = cost_weight * np.array(probe_prices(plant))
-    labels, hazard = len(plant.labels), _hazard(plant, process, period)
+    doubts, price = Doubt(plant, process, period, window), cost_weight * np.array(probe_prices(plant))
 
     def choose(doubt: Array, obs: Array, said: Diagnosis) -> tuple[Array, Array]:
-        label = np.clip(said.label, 0, labels - 1)
-        probs = np.eye(labels)[label] if said.label_probs is None else np.nan_to_num(said.label_probs)
-        doubt = np.minimum(doubt + hazard, 0.5 / labels)
-        doubt[np.arange(len(label)), label] = 0.0
-        probs = (1.0 - doubt.sum(axis=1, keepdims=True)) * probs + doubt
-        resolved = np.einsum("ni,pij,nj->np", probs, gains, probs) / 2.0
-        probe = (pays_for * (resolved - resolved[:, :1]) - price).argmax(axis=1)
-        return doubt * (1.0 - gains[probe, label]), probe
+        doubt, label, probs = doubts.believed(doubt, said)
+        probe = (pays_for * doubts.resolves(probs) - price).argmax(axis=1)
+        return doubts.after(doubt, label, probe), probe
 
-    return Prober(lambda n: np.zeros((n, labels)), choose)
-
-
-def _hazard(plant: Plant, process: str, period: int) -> float:
-    """The probability that a fault of one label begins within a decision, from flights of the process."""
-    flights = [draw(plant.process(process), seed) for seed in SEEDS[:100]]
-    begun = sum(len(s.faults) for s in flights)
-    return begun * period / sum(s.steps for s in flights) / (len(plant.labels) - 1)
-
-
-def divergences(plant: Plant, process: str, window: int) -> Array:
-    """D (bases, probes, labels, labels) over so many samples from when the faults begin, as late as they do in the process.
-
-    Bases are flights without a fault, on which faults of each label are put; of two labels the mean over their faults.
-    """
-    faults, label, onset = _examples(plant, process)
-    filtered = _steady(plant)
-    assert plant.acting is not None
-    found = []
-    for seed in SEEDS[:BASES]:
-        base = draw(plant.process(process), seed).without_faults().replace(physical={})
-        begins = min(onset, base.steps - window - 1)
-        begun = [[msgspec.structs.replace(f, onset=begins, end=None) for f in some] for some in faults]
-        scenarios = [base.replace(faults=some) for some in begun]
-        quiet = [no_noise(plant, base.steps)] * len(scenarios)
-        found.append([])
-        for number in range(len(plant.acting.probes)):
-            flights = Flights(plant, scenarios, quiet)
-            acts = Acts(flights, accommodation=False)
-            advance(flights, begins)
-            acts.choose(np.full(len(flights), number))
-            chunk = acts.advance(window)
-            nu = _innovations(plant, filtered, chunk.state[0], chunk.obs, begins)  # (window, flights, n_s), whitened
-            D = 0.5 * ((nu[:, :, None] - nu[:, None]) ** 2).sum(axis=(0, 3))
-            apart = np.zeros((len(plant.labels), len(plant.labels)))
-            for i, j in itertools.permutations(np.unique(label), 2):
-                apart[i, j] = np.nan_to_num(D[np.ix_(label == i, label == j)]).mean()
-            found[-1].append(apart)
-    return np.array(found)
-
-
-def _examples(plant: Plant, process: str) -> tuple[list[Any], Array, int]:
-    """Faults of each label that the process draws, a few of each, their labels, and the sample where half have begun."""
-    kept: dict[int, list[Any]] = {0: [[]]}
-    onsets = []
-    for seed in SEEDS[:400]:
-        scenario = draw(plant.process(process), seed)
-        if not scenario.faults:
-            continue
-        onsets.append(min(f.onset for f in scenario.faults))
-        together = [f for f in scenario.faults if f.onset == onsets[-1]]
-        label = plant.label_of(frozenset(f.mode for f in together))
-        if len(kept.setdefault(label, [])) < EXAMPLES:
-            kept[label].append(together)
-    label = np.repeat(list(kept), [len(some) for some in kept.values()])
-    return [faults for some in kept.values() for faults in some], label, int(np.median(onsets))
-
-
-def _steady(plant: Plant) -> tuple[Array, Array, Array]:
-    """Of the plant linearised at trim: gain K (n_x, n_s), outputs with noise (n_s,), whitening L^-1 (n_s, n_s), S = L L'."""
-    x, u = plant.trim_state, plant.trim_command
-    h = 1e-5 * np.maximum([s.scale for s in plant.states], 1e-3)
-    ahead = np.stack([plant.propagate(0.0, x + s, u) - plant.propagate(0.0, x - s, u) for s in np.diag(h)], axis=-1)
-    seen = np.array([s.sigma > 0 for s in plant.outputs])
-    sensed = np.stack([plant.measure(0.0, x + s, u) - plant.measure(0.0, x - s, u) for s in np.diag(h)], axis=-1)
-    A, C = (1.0 - 1e-4) * ahead / (2 * h), (sensed / (2 * h))[seen]
-    R = plant.R[np.ix_(seen, seen)]
-    P = scipy.linalg.solve_discrete_are(A.T, C.T, plant.Q + 1e-12 * np.eye(len(x)), R)
-    S = C @ P @ C.T + R
-    return np.linalg.solve(S, C @ P).T, seen, np.linalg.inv(np.linalg.cholesky(S))
-
-
-def _innovations(plant: Plant, steady: tuple[Array, Array, Array], x: Array, obs: Array, first: int) -> Array:
-    """The whitened innovations (K, n, n_s) of the healthy plant's filter from the states x (n, n_x) of a sample on."""
-    K, seen, whiten = steady
-    y, u, _ = plant.split(obs)
-    found = []
-    for k in range(len(obs)):
-        x = plant.propagate((first + k - 1) * plant.dt, x, u[k]) if k else x
-        nu = (y[k] - plant.measure((first + k) * plant.dt, x, u[k]))[:, seen]
-        found.append(nu @ whiten.T)
-        x = x + nu @ K.T
-    return np.array(found)
+    return Prober(doubts.begin, choose)

@@ -5,11 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from fdi_gym.agents import Prober
+from fdi_gym.diagnosis import prober
 from fdi_gym.diagnosis.contract import Diagnosis
 from fdi_gym.plant import Array, Plant
 
 
-def prober(plant: Plant, *, on: int = 10, every: int = 30, probes: tuple[str, ...] = ()) -> Prober:
+@prober("periodic_probes_5", "The plant's probes in turn, one for a twentieth of the time", on=1, every=20)
+@prober("periodic_probes_10", "The plant's probes in turn, one for a tenth of the time", on=2, every=20)
+@prober("periodic_probes_20", "The plant's probes in turn, one for a fifth of the time", on=4, every=20)
+@prober("periodic_probes_30", "The plant's probes in turn, one for 30 % of the time", reference=True, on=6, every=20)
+@prober("periodic_probes_60", "The plant's probes in turn, one for 60 % of the time", on=12, every=20)
+@prober("always_probes", "The plant's probes in turn, always one of them", reference=True, on=20, every=20)
+def periodic_probes(plant: Plant, *, on: int = 10, every: int = 30, probes: tuple[str, ...] = ()) -> Prober:
     """A probe for `on` decisions out of `every`, and then the next one.
 
     Args:

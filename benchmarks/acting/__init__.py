@@ -1,1 +1,1 @@
-"""Diagnoses that act: what probing and accommodation are worth. `python -m benchmarks.acting`."""
+"""Diagnoses that act: who enters which suite, and what could be known. `python -m benchmarks.acting`."""

@@ -1,53 +1,48 @@
-"""What probing and accommodation are worth, on every plant; the page `leaderboards/acting.md` and its pictures.
+"""The rows of the suites whose flights are acted on, and the page of what could be known with and without probes.
 
-    python -m benchmarks.acting [SUITE ...] [--page-only]
+    python -m benchmarks.acting [SUITE ...] [--bounds]
 
-Figures lie in `leaderboards/acting/`, one file a suite; what is there is not measured again: remove it for that.
+A row that is there is not made again. `fdi-gym leaderboard` renders the pages of the suites; the bounds are written here.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 from pathlib import Path
 
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[name] = "1"
 
-from benchmarks.acting import measure, page
-from benchmarks.acting.bounds import bounds
-from benchmarks.acting.suites import ACCOMMODATION, ACTIVE
+from benchmarks.acting.bounds import page
+from benchmarks.acting.entrants import ENTRANTS
+from fdi_gym.evaluation import applicable, evaluate
+from fdi_gym.row import row_path, write_rows
+from fdi_gym.suite import load_suite
 
 BOARDS = Path(__file__).parent.parent.parent / "leaderboards"
-DATA = BOARDS / "acting"
-
-
-def measured() -> dict[str, dict]:
-    """What has been measured, by suite."""
-    return {path.stem: json.loads(path.read_text()) for path in sorted(DATA.glob("*.json"))}
 
 
 def main() -> None:
-    """Measure, and write the page."""
-    everything = [*ACTIVE, *ACCOMMODATION, "bounds"]
+    """Make the rows that are missing, or the page of the bounds."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("suites", nargs="*", default=everything, metavar="SUITE", help=", ".join(everything))
-    parser.add_argument("--page-only", action="store_true", help="write the page of the figures that are there")
+    parser.add_argument("suites", nargs="*", metavar="SUITE", help=", ".join(ENTRANTS))
+    parser.add_argument("--bounds", action="store_true", help="the page of the bounds alone")
+    parser.add_argument("--jobs", type=int, default=-1)
     arguments = parser.parse_args()
-    for name in () if arguments.page_only else arguments.suites:
-        if name not in everything:
-            parser.error(f"unknown suite {name!r}; there are {', '.join(everything)}")
-        print(name, flush=True)
-        if name in ACTIVE:
-            measure.kept(DATA / f"{name}.json", lambda s=ACTIVE[name]: measure.probing(s))
-        elif name in ACCOMMODATION:
-            measure.kept(DATA / f"{name}.json", lambda s=ACCOMMODATION[name]: measure.accommodation(s))
-        else:
-            measure.kept(DATA / "bounds.json", lambda: {"rows": bounds()})
-    found = measured()
-    page.draw(found, BOARDS / "pictures")
-    (BOARDS / "acting.md").write_text(page.page(found, "leaderboards/acting"))
+    if arguments.bounds:
+        (BOARDS / "acting-bounds.md").write_text(page())
+        return
+    for name in arguments.suites or ENTRANTS:
+        if name not in ENTRANTS:
+            parser.error(f"unknown suite {name!r}; there are {', '.join(ENTRANTS)}")
+        suite, results = load_suite(name), BOARDS / "results"
+        missing = [entrant for entrant in ENTRANTS[name] if not row_path(results, name, entrant).exists()]
+        able, _ = applicable(suite, suite.build(), missing)
+        for entrant in able:
+            command = f"fdi-gym evaluate {name} --diagnosers {entrant}"
+            found = evaluate(suite, [entrant], work=Path("runs"), jobs=arguments.jobs, command=command)
+            write_rows(results, suite, found)
 
 
 if __name__ == "__main__":

@@ -41,12 +41,13 @@ def evaluate(
     backend: Backend = "loky",
     cluster: Cluster = {},  # noqa: B006 (tyro reads the default)
 ) -> None:
-    """Run diagnosers on suites, print the comparison table of each, and write one row per diagnoser and suite.
+    """Run diagnosers on suites, and probers on suites of probing, print the tables of each, and write their rows.
 
     Args:
         suites: Names of suites, or paths of suite files; "all" for every one that is here.
-        diagnosers: Names; "reference" for those that others are compared with first, "all" for every one, of which those
-            run that can on the suite's plant; "module:function" for your own.
+        diagnosers: Names, where the suite is of probing of probers too; "reference" for those that others are compared with
+            first, "all" for every one, of which those run that can on the suite's plant; "module:function" for your own;
+            "truth" where diagnoses are allowed for.
         results: Folder for the rows, written as soon as a suite is finished; without it nothing but the tables is made.
         work: Folder of finished blocks. A killed run goes on from there.
         jobs: Worker processes, -1 for one per core.
@@ -104,15 +105,19 @@ def _asked(suites: Sequence[str], diagnosers: Sequence[str], episodes: int | Non
     """What names of suites and of diagnosers stand for; what cannot run is said, before anything runs."""
     from fdi_gym import evaluation
     from fdi_gym.diagnosis import named
-    from fdi_gym.suite import load_suite, suite_names
+    from fdi_gym.diagnosis.registry import GROUPS
+    from fdi_gym.entrants import TRUTH
+    from fdi_gym.suite import ActingSuite, load_suite, suite_names
 
     loaded = {name: load_suite(name) for name in (suite_names() if "all" in suites else suites)}
     if not loaded:
         raise ValueError(f"evaluate a suite, or all; there are {', '.join(suite_names())}")
-    names, asked = named(diagnosers), []
+    asked = []
     for said, suite in loaded.items():
         suite = suite if episodes is None else suite.head(episodes)
-        plant = suite.build()
+        plant, acts = suite.build(), suite.acts if isinstance(suite, ActingSuite) else ""
+        names = named(diagnosers, acts == "probing")
+        names += [TRUTH.name] if acts == "accommodation" and set(diagnosers) & set(GROUPS) else []
         able, reasons = evaluation.applicable(suite, plant, names)
         for name, reason in reasons.items():
             print(f"{suite.name}: {name}: not applicable: {reason}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Diagnosers: the contract, the filters' contract, the guard, the registry (trainers too), and what is fitted for them."""
+"""Diagnosers: the contract, the filters' contract, the guard, the registry of all methods, and what is fitted for them."""
 
 from fdi_gym.diagnosis.contract import Decisions, Diagnoser, Diagnosis, run
 from fdi_gym.diagnosis.filtering import Filter, diagnoser_of
@@ -11,8 +11,11 @@ from fdi_gym.diagnosis.registry import (
     diagnoser,
     diagnosers,
     find_diagnoser,
+    find_prober,
     find_trainer,
     named,
+    prober,
+    probers,
     trainer,
     trainers,
 )  # fmt: skip
@@ -20,6 +23,7 @@ from fdi_gym.plant import NotApplicableError
 
 __all__ = [
     "Decisions", "Diagnoser", "Diagnosis", "Entry", "Filter", "NotApplicableError",
-    "broken_plugins", "diagnoser", "diagnoser_of", "diagnosers", "find_diagnoser", "find_trainer", "fit", "guarded",
-    "make_diagnoser", "named", "run", "train", "trainer", "trainers",
+    "broken_plugins", "diagnoser", "diagnoser_of", "diagnosers", "find_diagnoser", "find_prober",
+    "find_trainer", "fit", "guarded",
+    "make_diagnoser", "named", "prober", "probers", "run", "train", "trainer", "trainers",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Methods by name: how a diagnoser's builder or a trainer is made known and found, and what it takes.
+"""Methods by name: how the builder of a diagnoser or prober, or a trainer, is made known and found, and what it takes.
 
 A builder makes a diagnoser from a plant and from data; it flies nothing and reads no file:
 
@@ -8,14 +8,19 @@ A builder makes a diagnoser from a plant and from data; it flies nothing and rea
     @diagnoser("augmented_ekf", "Augmented extended Kalman filter")
     def augmented_ekf(plant: Plant, belief: Belief, calibration: Calibration, *, walk: float = 1.0) -> Diagnoser: ...
 
-A trainer makes weights for a diagnoser, in a folder of runs; it gives the path of the .safetensors file, whose card lies
-beside it:
+A prober's builder makes one of a plant (`fdi_gym.agents.Prober`): what is added to a flight to find its fault sooner:
+
+    @prober("periodic_probes", "The plant's probes in turn")
+    def periodic_probes(plant: Plant, *, on: int = 10, every: int = 30) -> Prober: ...
+
+A trainer makes weights for a diagnoser or a prober, in a folder of runs; it gives the path of the .safetensors file, whose
+card lies beside it:
 
     @trainer("sequence_net", "Recurrent network, supervised")
     def train_sequence_net(plant: Plant, *, budget: int | None, seed: int, work: Path, threads: int) -> Path: ...
 
 Arguments of the names in `GIVEN` are given to those that have them; all others are settings. Modules and packages of the
-entry-point group "fdi_gym.diagnosers" are imported to find both; none is listed. A module whose name begins with "_" is
+entry-point group "fdi_gym.diagnosers" are imported to find all; none is listed. A module whose name begins with "_" is
 left for those that need it, with whatever slow library it imports.
 """
 
@@ -34,13 +39,17 @@ from typing import Any, Literal, NamedTuple
 from fdi_gym.names import blame, check_diagnoser_name, find_function, unknown
 from fdi_gym.plant import NotApplicableError, Plant
 
-Kind = Literal["diagnoser", "trainer"]
+Kind = Literal["diagnoser", "prober", "trainer"]
 GIVEN: dict[Kind, dict[str, str]] = {  # arguments that are no settings
     "diagnoser": {
         "belief": "what it may assume of the plant, fitted to the process",
         "calibration": "when it alarms, fitted to the process",
         "process": "the fault process that will be met",
         "scenarios": "the truth: it is clairvoyant",
+    },
+    "prober": {
+        "process": "the fault process that will be met",
+        "period": "samples from one decision to the next",
     },
     "trainer": {
         "budget": "how much to train, in its own measure; None for its recipe's",
@@ -52,12 +61,12 @@ GIVEN: dict[Kind, dict[str, str]] = {  # arguments that are no settings
 
 
 class Entry(NamedTuple):
-    """A diagnoser or a trainer that can be asked for by name."""
+    """A diagnoser, a prober or a trainer that can be asked for by name."""
 
     kind: Kind
     name: str
     summary: str
-    build: Callable[..., Any]  # the builder of the diagnoser, or the function that trains
+    build: Callable[..., Any]  # the builder of the diagnoser or prober, or the function that trains
     settings: Mapping[str, Any]  # that belong to the name
     knows: str = ""  # of the truth, in words; empty for a method that is told nothing
     ceiling: bool = False  # what it knows is more than any method can find out: it frames a table
@@ -150,7 +159,7 @@ GROUPS: dict[str, Callable[[Entry], bool]] = {
     "all": lambda entry: True,
     "reference": lambda entry: entry.reference or entry.ceiling,
 }
-_entries: dict[Kind, dict[str, Entry]] = {"diagnoser": {}, "trainer": {}}
+_entries: dict[Kind, dict[str, Entry]] = {"diagnoser": {}, "prober": {}, "trainer": {}}
 
 
 def diagnoser(
@@ -184,6 +193,15 @@ def diagnoser(
     return functools.partial(_register, "diagnoser", name, summary, settings, (knows, ceiling, reference, sensors))
 
 
+def prober(name: str, summary: str, *, reference: bool = False, **settings: Any) -> Callable[[Any], Any]:
+    """Make a prober's builder known under a name, as `diagnoser` does with a diagnoser's; no diagnoser has that name.
+
+    Raises:
+        ValueError: As there.
+    """
+    return functools.partial(_register, "prober", name, summary, settings, ("", False, reference))
+
+
 def trainer(name: str, summary: str, **settings: Any) -> Callable[[Any], Any]:
     """Make a training function known under a name, as `diagnoser` does with a builder.
 
@@ -203,9 +221,13 @@ def _register(
 ) -> Callable[..., Any]:
     if name in GROUPS:
         raise ValueError(f"{name!r} is a group of diagnosers, and cannot be the name of one")
-    taken = _entries[kind].get(name)
+    rivals = ("diagnoser", "prober") if kind != "trainer" else ("trainer",)  # that are asked for in one place
+    taken = next((_entries[rival][name] for rival in rivals if name in _entries[rival]), None)
     if taken is not None and (taken.build.__module__, taken.build.__qualname__) != (build.__module__, build.__qualname__):
-        raise ValueError(f"two {kind}s are called {name!r}: {taken.build.__module__} and {build.__module__}")
+        raise ValueError(
+            f"two {kind if kind == taken.kind else 'method'}s are called {name!r}: "
+            f"{taken.build.__module__} and {build.__module__}"
+        )
     allowed = inspect.signature(build).parameters
     for setting in settings:
         if setting not in allowed:
@@ -244,17 +266,23 @@ def diagnosers() -> dict[str, Entry]:
     return _known("diagnoser")
 
 
+def probers() -> dict[str, Entry]:
+    """All probers by name, in the order in which their modules declare them."""
+    return _known("prober")
+
+
 def trainers() -> dict[str, Entry]:
     """All trainers by name, in the order in which their modules declare them."""
     return _known("trainer")
 
 
-def named(names: Iterable[str]) -> list[str]:
-    """These names, each once, with the diagnosers of a group (`GROUPS`) in its place."""
+def named(names: Iterable[str], probing: bool = False) -> list[str]:
+    """These names, each once, with the diagnosers of a group (`GROUPS`) in its place; with probing its probers too."""
     found: list[str] = []
+    entries = [*diagnosers().values(), *(probers().values() if probing else ())]
     for name in names:
         belongs = GROUPS.get(name)
-        found += [name] if belongs is None else [entry.name for entry in diagnosers().values() if belongs(entry)]
+        found += [name] if belongs is None else [entry.name for entry in entries if belongs(entry)]
     return list(dict.fromkeys(found))
 
 
@@ -266,7 +294,7 @@ def _find(kind: Kind, name: str) -> Entry:
         except (ValueError, TypeError):  # a builtin
             arguments = {}
         if not arguments:
-            raise ValueError(f"{name} is no {'builder of a diagnoser' if kind == 'diagnoser' else kind}: it takes no plant")
+            raise ValueError(f"{name} is no {kind if kind == 'trainer' else f'builder of a {kind}'}: it takes no plant")
         return Entry(kind, name, (inspect.getdoc(build) or name).splitlines()[0], build, {})
     found = _known(kind)
     if name not in found:
@@ -281,6 +309,15 @@ def find_diagnoser(name: str) -> Entry:
         ValueError: There is none; the message lists those that exist.
     """
     return _find("diagnoser", name)
+
+
+def find_prober(name: str) -> Entry:
+    """The prober of this name; "module:function" names a builder that is not discovered.
+
+    Raises:
+        ValueError: There is none; the message lists those that exist.
+    """
+    return _find("prober", name)
 
 
 def find_trainer(name: str) -> Entry:

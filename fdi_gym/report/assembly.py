@@ -10,6 +10,7 @@ from fdi_gym.names import unknown
 from fdi_gym.report.figures import figures
 from fdi_gym.report.flown import Budget, chosen, flown
 from fdi_gym.report.page import LARGEST, html
+from fdi_gym.suite import ActingSuite
 
 FLIGHTS, METHODS = 16, 4
 OVERHEAD = 0.25  # of the largest size: what is kept for the page and for what does not shrink with the points
@@ -26,10 +27,14 @@ def report(board: Board, methods: Sequence[str] = (), flights: int = FLIGHTS, pr
         progress: Show a progress bar while methods run.
 
     Raises:
-        ValueError: The suite has no rows, there are not so many flights, an unknown method, one that cannot run on the
-            plant, or more than fits into `LARGEST` bytes.
+        ValueError: The suite's flights are acted on, it has no rows, there are not so many flights, an unknown
+            method, one that cannot run on the plant, or more than fits into `LARGEST` bytes.
     """
     suite = board.suite
+    if isinstance(suite, ActingSuite):
+        raise ValueError(
+            f"the flights of {suite.name} answer to who acts on them: its page has the pictures (fdi-gym leaderboard)"
+        )
     if not board.rows:
         raise ValueError(f"there are no rows of {suite.name}: fdi-gym evaluate {suite.name} --results FOLDER makes them")
     if not 0 <= flights <= suite.episodes:

@@ -18,8 +18,8 @@ from tqdm import tqdm
 from fdi_gym.declaration import runs
 from fdi_gym.diagnosis import Decisions, make_diagnoser, run
 from fdi_gym.engine import Record
+from fdi_gym.entrants import settings_of
 from fdi_gym.estimation.equivalent import nearest
-from fdi_gym.evaluation import settings_of
 from fdi_gym.leaderboard import Board
 from fdi_gym.metrics import DEVIATIONS
 from fdi_gym.names import blamed

@@ -1,0 +1,18 @@
+"""Chance that is a flight's own: the same for it alone as in any batch, and on any run."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fdi_gym.plant import Array
+
+
+def uniform(obs: Array, count: int, seed: int) -> Array:
+    """Numbers from 0 to 1 (n, count), from a hash of the newest samples (n, n_obs)."""
+    bits = np.ascontiguousarray(obs, float).view(np.uint64).sum(axis=1, dtype=np.uint64)[:, None]
+    with np.errstate(over="ignore"):  # splitmix64, a stream for each number
+        h = bits + np.uint64(0x9E3779B97F4A7C15) * np.arange(seed * count + 1, (seed + 1) * count + 1, dtype=np.uint64)
+        h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        h = h ^ (h >> np.uint64(31))
+    return (h >> np.uint64(11)) / 2.0**53

@@ -1,0 +1,329 @@
+"""The page of a suite whose flights are acted on: curves of probing against its cost, and what accommodation recovers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fdi_gym.comparison import Drawn, draw_again
+from fdi_gym.diagnosis import probers
+from fdi_gym.entrants import NOTHING, TRUTH, fly_entrant
+from fdi_gym.intervals import mean_interval
+from fdi_gym.metrics import Outcome
+from fdi_gym.plant import Array, Plant
+from fdi_gym.row import Row
+from fdi_gym.scores import costs
+from fdi_gym.suite import ActingSuite
+from fdi_gym.tables import FLOOR, clairvoyant, markdown, plain
+
+BLIND = ("periodic_probes", "random_probes")  # builders of probers that look at nothing: others are held against them
+NEVER = "never"  # the family of those that don't probe
+WORSE = 1.05  # a flight is worse where it costs more than so many times what it costs with nothing
+
+PROBING = """An entrant is a diagnoser that never probes, or a prober with `{on_board}` on board that chooses a probe every
+{period} samples. Costs are the plant's flight cost per sample, tracking error and effort; what a prober costs is what
+the flights cost more than without a probe. Differences are paired, the same flights and the same noise, with 95 %
+intervals; the best that never probes is `{passive}`. "At this cost" compares a prober that looks with those that
+probe by the clock or by chance: their best mixture of the same mean cost. Delays run from the onset to the right
+label; longer ones than the median fault's length count as that.
+"""
+ACCOMMODATION = """Every {period} samples the controller is reconfigured for what the entrant says: `null` says
+nothing, `truth` is always right, `false_alarm` names one fault all the time. Costs are the plant's flight cost per
+sample. "Recovered" is the share of what the truth recovers of the cost, where it recovers more than chance; "averted"
+and "caused" are flights that leave their envelope with nothing and not with the entrant, and the reverse, in brackets
+those without a fault, which a false alarm has caused; "worse" is the share of faulty flights that cost 5 % more than
+with nothing. Intervals are 95 %, by resampled flights.
+"""
+
+
+class Acted(NamedTuple):
+    """The rows of a suite with what they are compared by."""
+
+    suite: ActingSuite
+    plant: Plant
+    rows: list[Row]
+    outcomes: Mapping[str, list[Outcome]]
+
+    def cost(self, name: str) -> Array:
+        """The cost of each flight."""
+        return costs(self.outcomes[name])
+
+    def drawn(self, kind: str = "per_sample") -> Drawn:
+        """All rows on resamples of the flights."""
+        return draw_again(dict(self.outcomes), len(self.plant.labels), kind)
+
+    def passive(self) -> Row | None:
+        """The best row that never probes and is told nothing."""
+        mine = [row for row in self.rows if family(row) == NEVER and not clairvoyant(row)]
+        return max(mine, key=accuracy, default=None)
+
+    def chosen(self) -> Row | None:
+        """The best row of a prober that looks; of any where none does."""
+        mine = [row for row in self.rows if family(row) != NEVER]
+        return max([row for row in mine if family(row) not in BLIND] or mine, key=accuracy, default=None)
+
+
+def accuracy(row: Row) -> float:
+    """Balanced accuracy per sample."""
+    return row.metrics["per_sample"]["balanced_accuracy"] or 0.0
+
+
+def family(row: Row) -> str:
+    """Whose curve a row is on: the builder of its prober, its own where it is not installed, or `NEVER`."""
+    entry = probers().get(row.diagnoser)
+    if entry is not None:
+        return entry.build.__name__
+    return row.diagnoser if ":" in row.diagnoser and row.metrics["acting"]["probed"] > 0 else NEVER
+
+
+def delays(outcomes: Sequence[Outcome], horizon: int, dt: float) -> Array:
+    """Time [s] from each flight's first onset to its right label, the horizon [samples] where longer; nan where healthy."""
+    found = []
+    for flight in outcomes:
+        first = flight.onsets[0] if flight.onsets else None
+        late = horizon if first is None or first.isolation is None else min(first.isolation, horizon)
+        found.append(np.nan if first is None else 0.0 if first.labelled else late * dt)
+    return np.array(found)
+
+
+def horizon(outcomes: Sequence[Outcome]) -> int:
+    """Samples of the median flight's first fault."""
+    lengths = [flight.onsets[0].length for flight in outcomes if flight.onsets]
+    return int(np.median(lengths)) if lengths else 0
+
+
+def at_this_cost(acted: Acted, drawn: Drawn, row: Row) -> tuple[float, float, float] | None:
+    """Accuracy of a row more than that of the best mixture of two rows which do not look and cost the same on average.
+
+    None where no two have its cost between them.
+    """
+    if family(row) in (*BLIND, NEVER):
+        return None
+    passive, mine = acted.passive(), float(acted.cost(row.diagnoser).mean())
+    blind = [r.diagnoser for r in acted.rows if family(r) in BLIND] + ([passive.diagnoser] if passive else [])
+    price = {name: float(acted.cost(name).mean()) for name in blind}
+    best: tuple[float, Array] | None = None
+    for a in blind:
+        for b in blind:
+            if price[a] <= mine < price[b]:
+                share = (price[b] - mine) / (price[b] - price[a])
+                i, j = drawn.names.index(a), drawn.names.index(b)
+                score = share * drawn.score[i] + (1.0 - share) * drawn.score[j]
+                if best is None or score > best[0]:
+                    best = float(score), share * drawn.again[:, i] + (1.0 - share) * drawn.again[:, j]
+    if best is None:
+        return None
+    k = drawn.names.index(row.diagnoser)
+    gap, reach = float(drawn.score[k] - best[0]), 1.96 * float(np.std(drawn.again[:, k] - best[1]))
+    return gap, gap - reach, gap + reach
+
+
+def said(value: Sequence[float] | None, digits: int = 3, factor: float = 1.0) -> str:
+    """A figure with its interval."""
+    if value is None:
+        return "-"
+    middle, low, high = (factor * v for v in value)
+    return f"{middle:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def probing_table(acted: Acted, width: int | None = None) -> str:
+    """Who enters a suite of probing, best accuracy first."""
+    passive, drawn, lines = acted.passive(), acted.drawn(), []
+    for row in sorted(acted.rows, key=lambda row: (-accuracy(row), row.diagnoser)):
+        name, m = row.diagnoser, row.metrics
+        gain = late = added = None
+        if passive is not None:
+            gain = drawn.difference(name, passive.diagnoser)
+            far = horizon(acted.outcomes[name])
+            mine, theirs = (delays(acted.outcomes[n], far, acted.plant.dt) for n in (name, passive.diagnoser))
+            gaps = (mine - theirs)[np.isfinite(mine)]
+            late = mean_interval(gaps) if gaps.size else None
+            added = mean_interval(acted.cost(name) - acted.cost(passive.diagnoser))
+        mean = m["detection"]["isolation_delay_restricted_mean"]
+        alarms = m["detection"]["false_alarms_per_hour"]
+        lines.append([
+            plain(name), *(said([v["balanced_accuracy"], *v["balanced_accuracy_interval"]], 1, 100.0)
+                           for v in (m["per_sample"], m["per_decision"])),
+            said(gain, 1, 100.0), "-" if mean is None else f"{mean:.2f}", said(late, 2), said(added),
+            said(at_this_cost(acted, drawn, row), 1, 100.0), f"{100 * m['acting']['probed']:.0f}",
+            "-" if alarms is None else f"{alarms:.1f}",
+        ])  # fmt: skip
+    head = ["entrant", "per sample %", "per decision %", "more than the best passive", "isolated after s",
+            "later than the best passive s", "added cost", "more at this cost", "probed %", "false alarms/h"]  # fmt: skip
+    return markdown(head, lines, width)
+
+
+def truths(outcomes: Sequence[Outcome]) -> Array:
+    """The label of each flight's first fault, 0 where it has none."""
+    return np.array([flight.onsets[0].label if flight.onsets else 0 for flight in outcomes])
+
+
+def recovered(nothing: Array, mine: Array, truth: Array) -> tuple[float, float, float] | None:
+    """The share of what the truth recovers, of sums over flights, with its interval from resampled flights.
+
+    None where the truth recovers no more than chance.
+    """
+    if len(truth) < 2 or mean_interval(nothing - truth)[1] <= 0:
+        return None
+    drawn = np.random.default_rng(0).integers(len(mine), size=(2000, len(mine)))
+    gained, possible = (nothing - mine)[drawn].sum(axis=1), (nothing - truth)[drawn].sum(axis=1)
+    low, high = np.percentile(gained / np.maximum(possible, 1e-12), [2.5, 97.5])
+    return float((nothing - mine).sum() / (nothing - truth).sum()), float(low), float(high)
+
+
+def shares(acted: Acted, name: str, mask: Array | None = None) -> tuple[float, float, float] | None:
+    """What an entrant recovers, of some of the flights; None where nothing or the truth has no row, too."""
+    if not {NOTHING, TRUTH.name} <= set(acted.outcomes):
+        return None
+    chosen = np.ones(acted.suite.episodes, bool) if mask is None else mask
+    return recovered(*(acted.cost(n)[chosen] for n in (NOTHING, name, TRUTH.name)))
+
+
+def accommodation_table(acted: Acted, width: int | None = None) -> str:
+    """Who enters a suite of accommodation, the cheapest first."""
+    lost = {name: np.array([flight.terminated for flight in some]) for name, some in acted.outcomes.items()}
+    lines = []
+    for row in sorted(acted.rows, key=lambda row: (row.metrics["acting"]["cost"], row.diagnoser)):
+        name, m = row.diagnoser, row.metrics
+        label = truths(acted.outcomes[name])
+        averted = caused = worse = "-"
+        if NOTHING in lost:
+            more = ~lost[NOTHING] & lost[name]
+            averted, caused = (
+                str(int((lost[NOTHING] & ~lost[name]).sum())),
+                f"{int(more.sum())} ({int(more[label == 0].sum())})",
+            )
+            faulty = label > 0
+            worse = f"{100 * (acted.cost(name) > WORSE * acted.cost(NOTHING))[faulty].mean():.0f}" if faulty.any() else "-"
+        found = m["per_sample"]
+        lines.append([
+            plain(name), said([m["acting"]["cost"], *m["acting"]["cost_interval"]]), said(shares(acted, name), 0, 100.0),
+            str(int(lost[name].sum())), averted, caused, worse, str(m["acting"]["unusable"]),
+            said([found["balanced_accuracy"], *found["balanced_accuracy_interval"]], 1, 100.0),
+        ])  # fmt: skip
+    head = ["entrant", "cost", "recovered %", "flights lost", "averted", "caused (healthy)", "worse %", "unusable",
+            "accuracy per sample %"]  # fmt: skip
+    return markdown(head, lines, width)
+
+
+def by_fault_table(acted: Acted, width: int | None = None) -> str:
+    """The cost of each fault by entrant; in brackets the share recovered, in percent."""
+    names = [row.diagnoser for row in sorted(acted.rows, key=lambda row: (row.metrics["acting"]["cost"], row.diagnoser))]
+    label, lines = truths(acted.outcomes[names[0]]), []
+    for value in np.unique(label):
+        mask, cells = label == value, []
+        for name in names:
+            share = shares(acted, name, mask)
+            back = f" ({100 * share[0]:.0f})" if share is not None and name not in (NOTHING, TRUTH.name) else ""
+            cells.append(f"{acted.cost(name)[mask].mean():.3f}{back}")
+        lines.append([plain(acted.plant.labels[value].name), str(int(mask.sum())), *cells])
+    return markdown(["fault", "flights", *map(plain, names)], lines, width)
+
+
+def verdict(acted: Acted) -> str:
+    """What a suite of probing says, in words made of its figures."""
+    chosen, passive = acted.chosen(), acted.passive()
+    if chosen is None or passive is None:
+        return ""
+    drawn, name = acted.drawn(), chosen.diagnoser
+    others = [r.diagnoser for r in acted.rows if family(r) == NEVER and not clairvoyant(r)]
+    gain = drawn.difference(name, passive.diagnoser)
+    far = horizon(acted.outcomes[name])
+    mine = delays(acted.outcomes[name], far, acted.plant.dt)
+    late = {n: mean_interval((mine - delays(acted.outcomes[n], far, acted.plant.dt))[np.isfinite(mine)]) for n in others}
+    sure = all(drawn.difference(name, n)[1] > 0 for n in others) and all(gap[2] < 0 for gap in late.values())
+    added = mean_interval(acted.cost(name) - acted.cost(passive.diagnoser))
+    return (
+        f"The best chosen probing, `{name}`, has {said(gain, 1, 100.0)} points of accuracy per sample more than the best "
+        f"that never probes, and isolates {said(late[passive.diagnoser], 2)} s later, at a cost of {said(added)}: it "
+        f"{'beats every entrant that never probes' if sure else 'does not beat every entrant that never probes'} in both."
+    )
+
+
+def tables(acted: Acted, width: int | None = None) -> str:
+    """The tables of a suite."""
+    if acted.suite.acts == "probing":
+        return probing_table(acted, width)
+    return f"{accommodation_table(acted, width)}\n\nCost by fault:\n\n{by_fault_table(acted, width)}"
+
+
+def page(acted: Acted) -> str:
+    """What a suite's page says below its head."""
+    suite, period = acted.suite, acted.suite.decision_period
+    picture = f"pictures/{suite.name}"
+    if suite.acts == "accommodation":
+        drawing = f"\n![What is recovered]({picture}.png)\n"
+        return "\n".join([ACCOMMODATION.format(period=period), tables(acted), drawing])
+    passive = acted.passive()
+    words = PROBING.format(on_board=suite.on_board, period=period, passive=passive.diagnoser if passive else "nobody")
+    shown = [f"\n![Accuracy against cost]({picture}.png)\n"]
+    shown += [f"![A flight]({picture}-flight.png)\n"] if passive is not None and acted.chosen() is not None else []
+    return "\n".join([words, f"{verdict(acted)}\n", tables(acted), *shown])
+
+
+def _passed(row: Row) -> tuple[float, float, float]:
+    found = row.metrics["per_sample"]
+    return (accuracy(row), *(found["balanced_accuracy_interval"] or (accuracy(row), accuracy(row))))
+
+
+def draw(acted: Acted, folder: Path) -> None:
+    """Draw the pictures of a suite's page into a folder: curves or costs, and a flight with its probes."""
+    from fdi_gym import plots
+
+    suite, passive, chosen = acted.suite, acted.passive(), acted.chosen()
+    folder.mkdir(parents=True, exist_ok=True)
+    title = f"{suite.name}, {suite.episodes} flights, 95 % intervals"
+    if suite.acts == "accommodation":
+        points = [plots.Point(row.diagnoser, _passed(row), mean_interval(acted.cost(row.diagnoser))) for row in acted.rows]
+        plots.allowances(points, title).savefig(folder / f"{suite.name}.png")
+        return
+    curves: dict[str, list[plots.Point]] = {}
+    for row in acted.rows:
+        added = acted.cost(row.diagnoser) - (0.0 if passive is None else acted.cost(passive.diagnoser))
+        curves.setdefault(family(row), []).append(plots.Point(row.diagnoser, _passed(row), mean_interval(added)))
+    plots.pareto(curves, f"{title}; {suite.on_board} on board").savefig(folder / f"{suite.name}.png")
+    if passive is not None and chosen is not None:
+        flight(acted, (passive.diagnoser, chosen.diagnoser)).savefig(folder / f"{suite.name}-flight.png")
+
+
+def flight(acted: Acted, names: Sequence[str], episode: int | None = None) -> Any:
+    """A figure of one flight under several entrants.
+
+    Args:
+        acted: The rows.
+        names: The entrants; the last one's probes are shown.
+        episode: Which flight. Default: the one on which the last is right for longer than the first by most.
+    """
+    from fdi_gym import plots
+
+    if episode is None:
+        right = [np.array([sum(c for true, said, c in f.confusion if true == said) for f in acted.outcomes[name]])
+                 for name in (names[0], names[-1])]  # fmt: skip
+        episode = int(np.argmax(right[1] - right[0]))
+    shown, label = {}, np.zeros(1, int)
+    for name in names:
+        found = fly_entrant(acted.suite, acted.plant, name, [episode])
+        rows = slice(0, int(found.record.length[0]) + 1)
+        label, probs = found.record.label[0, rows], found.decisions.label_probs
+        declared = np.clip(found.decisions.label[0, rows], 0, len(acted.plant.labels) - 1)
+        belief = np.eye(len(acted.plant.labels))[declared] if probs is None else probs[0, rows]
+        shown[name] = plots.Shown(belief, found.probe[0, rows], found.cost[0, rows])
+    return plots.acted_flight(acted.plant, label, shown, f"{acted.suite.name}, flight {episode}")
+
+
+def in_a_line(acted: Acted) -> str:
+    """What a suite comes to, for the page that leads to it."""
+    if acted.suite.acts == "probing":
+        chosen, passive = acted.chosen(), acted.passive()
+        if chosen is None or passive is None:
+            return "-"
+        return f"{plain(chosen.diagnoser)} {100 * accuracy(chosen):.1f}, passive {100 * accuracy(passive):.1f}"
+    own = [r for r in acted.rows if not clairvoyant(r) and r.diagnoser not in (TRUTH.name, "false_alarm", *FLOOR)]
+    best = min(own, key=lambda row: row.metrics["acting"]["cost"], default=None)
+    share = None if best is None else shares(acted, best.diagnoser)
+    if best is None or share is None:
+        return "nothing to recover"
+    return f"{plain(best.diagnoser)} recovers {said(share, 0, 100.0)}"
