@@ -28,7 +28,7 @@ from sheets import data_sheet, methods, origins, plants, suite_sheet, suites
 from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.leaderboard import read_board
 from fdi_gym.report import report
-from fdi_gym.suite import ActingSuite, load_suite, suite_names
+from fdi_gym.suite import load_suite, suite_names
 
 BOARDS = ROOT / "leaderboards"
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)")
@@ -58,9 +58,11 @@ def on_config(config: Any) -> Any:
         "@suites": ["suites/index.md", *({name: f"suites/{name}.md"} for name in suite_names())],
         "@boards": ["boards/README.md", {"Grid of methods and plants": "boards/grid.md"},
                     {"Learned": "boards/learning/README.md"}, {"Coverage of the intervals": "boards/coverage.md"},
-                    {"Bounds with probes": "boards/acting-bounds.md"}, {"Sensors": "boards/sensors.md"}, {"Missing samples": "boards/gaps.md"},
+                    {"Bounds with probes": "boards/acting-bounds.md"}, {"Sensors": "boards/sensors.md"},
+                    {"Missing samples": "boards/gaps.md"},
                     {"Structural isolability": "boards/isolability.md"},
-                    *({path.stem: f"boards/{path.name}"} for path in sorted(BOARDS.glob("*-*.md")) if path.stem in suite_names())],
+                    *({path.stem: f"boards/{path.name}"} for path in sorted(BOARDS.glob("*-*.md"))
+                      if path.stem in suite_names())],
         "@reproduction": ["boards/reproduction/README.md",
                           *({path.stem: f"boards/reproduction/{path.name}"} for path in _reproduction())],
         "@reference": [{title: f"reference/{_slug(title)}.md"} for title in REFERENCE],
