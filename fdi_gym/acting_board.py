@@ -266,7 +266,8 @@ def page(acted: Acted) -> str:
 
 def _passed(row: Row) -> tuple[float, float, float]:
     found = row.metrics["per_sample"]
-    return (accuracy(row), *(found["balanced_accuracy_interval"] or (accuracy(row), accuracy(row))))
+    low, high = found["balanced_accuracy_interval"] or (accuracy(row), accuracy(row))
+    return accuracy(row), low, high
 
 
 def draw(acted: Acted, folder: Path) -> None:

@@ -16,7 +16,7 @@ from fdi_gym.agents import NEVER, Prober, fly
 from fdi_gym.diagnosis import Decisions, Diagnoser, Entry, diagnosers, find_diagnoser, find_prober, make_diagnoser, probers
 from fdi_gym.engine import Record
 from fdi_gym.metrics import Acted
-from fdi_gym.names import blame, blamed, find_function, unknown
+from fdi_gym.names import blame, blamed, check_diagnoser_name, find_function, unknown
 from fdi_gym.plant import Plant
 from fdi_gym.suite import ActingSuite, AnySuite
 
@@ -46,7 +46,8 @@ def find_entrant(suite: AnySuite, plant: Plant, name: str) -> Entry:
 
 def _is_prober(suite: AnySuite, plant: Plant, name: str) -> bool:
     """Whether a builder outside the package makes a prober: one that takes nothing that only diagnosers get is asked."""
-    build = find_function("prober or diagnoser", name)
+    probing = isinstance(suite, ActingSuite) and suite.acts == "probing"
+    build = find_function("prober or diagnoser" if probing else "diagnoser", check_diagnoser_name(name))
     if build not in _probes:
         _probes[build] = any(entry.build is build for entry in probers().values())
         try:
