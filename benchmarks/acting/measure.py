@@ -169,8 +169,8 @@ def _always(plant: Plant) -> Diagnoser:
     for i, label in enumerate(plant.labels):
         for mode in plant.modes:
             if mode.name in label.modes:
-                size = mode.reach[0] + 2 / 3 * (mode.reach[1] - mode.reach[0])
-                estimates[i] += np.array(mode.offset) + size * np.array(mode.direction)
+                low, high = mode.reaches.T
+                estimates[i] += np.array(mode.offset) + (low + 2 / 3 * (high - low)) @ mode.directions
 
     def update(n: int, obs: Array) -> tuple[int, Diagnosis]:
         label = 1 + np.arange(len(obs)) % (len(plant.labels) - 1)
