@@ -89,7 +89,9 @@ class Bank(NamedTuple):
     log: Array  # (n, r) log likelihood since the last change
     changes: Array  # (n, K + 1) bool
     acts: Array  # (n, K + 1) bool
+    allowed: Array  # (n, K + 1, labels) bool, or (n, 0, labels) where all are
     now: Array  # (n,) bool: a fault acts
+    among: Array  # (n, labels) bool: which are allowed now
     nu: Array  # (n, m) innovation of the healthy filter
     S: Array  # (n, m, m) its covariance
     checks: Checks | None
@@ -111,6 +113,11 @@ def told_onset_bank(plant: Plant, belief: Belief, *, scenarios: Sequence[FaultSc
     Raises:
         ValueError (from init): The number of episodes is not that of the scenarios.
     """
+    return bank(plant, belief, scenarios)
+
+
+def bank(plant: Plant, belief: Belief, scenarios: Sequence[FaultScenario], allowed: Array | None = None) -> Diagnoser:
+    """The oracle; where it is told more, with the labels that can be at each sample, allowed (n, K + 1, labels) bool."""
     r = rows(plant, belief)
     model, z, x, count = r.model, r.model.z, r.model.x, len(r.label)
     N, m, labels = len(model.scale), len(belief.R), len(plant.labels)
@@ -122,8 +129,10 @@ def told_onset_bank(plant: Plant, belief: Belief, *, scenarios: Sequence[FaultSc
     def start(n: int) -> Bank:
         changes, acts = label_changes(plant, scenarios, n)
         X, P = np.tile(model.X0, (n, count, 1)), np.tile(model.P0, (n, count, 1, 1))
+        every = np.ones((n, labels), bool)
         return Bank(
-            X, P, np.zeros((n, count)), changes, acts, np.zeros(n, bool), np.zeros((n, m)), np.tile(belief.R, (n, 1, 1)),
+            X, P, np.zeros((n, count)), changes, acts, every[:, None][:, :0] if allowed is None else allowed,
+            np.zeros(n, bool), every, np.zeros((n, m)), np.tile(belief.R, (n, 1, 1)),
             None if checks is None else checks.start(n),
         )  # fmt: skip
 
@@ -138,7 +147,8 @@ def told_onset_bank(plant: Plant, belief: Belief, *, scenarios: Sequence[FaultSc
         P[changed, :, :, z] = 0.0
         P[..., z, z] = np.where(changed[:, None, None, None], r.M0, P[..., z, z])
         X1, P1 = model.predict("extended", X.reshape(-1, N), P.reshape(-1, N, N), at)
-        return s._replace(X=X1.reshape(n, count, N), P=P1.reshape(n, count, N, N), log=log, now=now)
+        among = s.allowed[each, k] if s.allowed.shape[1] else s.among
+        return s._replace(X=X1.reshape(n, count, N), P=P1.reshape(n, count, N, N), log=log, now=now, among=among)
 
     def update(s: Bank, at: Interval, y: Array, seen: Array) -> Bank:
         n = len(s.now)
@@ -159,7 +169,9 @@ def told_onset_bank(plant: Plant, belief: Belief, *, scenarios: Sequence[FaultSc
             by_label[:, label] = logsumexp(log[:, r.label == label], axis=1)
         if checks is not None and s.checks is not None:
             gain = checks.repeated(s.checks)
-            by_label = np.where(gain > 0, np.maximum(by_label, s.log[:, :1] + 0.5 * gain), by_label)
+            least = s.log[:, :1] if allowed is None else s.log.max(axis=1, keepdims=True)  # the reading itself was certain
+            by_label = np.where(gain > 0, np.maximum(by_label, least + 0.5 * gain), by_label)
+        by_label[~s.among] = -np.inf
         by_label[~s.now] = -np.inf
         by_label[~s.now, 0] = 0.0
         probs = np.exp(by_label - logsumexp(by_label, axis=1, keepdims=True))
