@@ -2,7 +2,7 @@
 
 Which sensor it is, the bank of `told_onset_bank` says among the sensors' labels. Which of the plant's own faults it is, the
 plant's own ceiling says, which knows when they act and marginalises what else is unknown of that plant; where it has none
-the bank does, among the plant's labels. What is lost on a plant is then what nobody can tell apart there.
+the bank does, among the plant's labels, with the same prior for all. What is lost is what nobody can tell apart there.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from baselines.oracles.cramer_rao_oracle import cramer_rao_oracle
@@ -31,8 +32,22 @@ class Told(NamedTuple):
 
     bank: Any
     own: Any
-    sensor: Array  # (n, K + 1) bool: a sensor failed over the interval that ends at a sample
+    label: Array  # (n, K + 1) the true one; whether there is a fault, and whether a sensor's, is all that is read of it
     k: Array  # (n,)
+
+
+def even(plant: Plant, belief: Belief) -> Belief:
+    """The belief, with each magnitude of the plant's own modes anywhere in its reach and walks alike in shares of that.
+
+    The flights that a belief is found from show a mode that is rare once or never, and half of the faults are sensors'.
+    """
+    own = slice(0, plant.n_magnitudes if plant.bare is None else plant.bare.n_magnitudes)
+    low, high = plant.reaches[own].T
+    span = np.where(high > low, high - low, 1.0)
+    mean, std, walk = belief.m_mean.copy(), belief.m_std.copy(), belief.m_walk.copy()
+    mean[own], std[own] = (low + high) / 2, (high - low) / 12**0.5
+    walk[own] = np.median(walk[own] / span) * span
+    return msgspec.structs.replace(belief, m_mean=mean, m_std=std, m_walk=walk)
 
 
 def own_ceiling(plant: Plant, scenarios: Sequence[FaultScenario]) -> Diagnoser | None:
@@ -69,25 +84,28 @@ def told_source_oracle(plant: Plant, belief: Belief, *, scenarios: Sequence[Faul
     if plant.bare is None:
         raise NotApplicableError(f"no label of {plant.id} is a sensor's fault; with the option sensor_faults there are")
     labels, of_plant = len(plant.labels), len(plant.bare.labels)
-    sensor = np.zeros((len(scenarios), 1 + max(s.steps for s in scenarios)), bool)
-    for row, scenario in zip(sensor, scenarios, strict=True):
-        rows = plant.label_rows(scenario) >= of_plant
+    label = np.zeros((len(scenarios), 1 + max(s.steps for s in scenarios)), np.int64)
+    for row, scenario in zip(label, scenarios, strict=True):
+        rows = plant.label_rows(scenario)
         row[: len(rows)], row[len(rows) :] = rows, rows[-1]
-    hypotheses = bank(plant, belief, scenarios, sensor[..., None] == (np.arange(labels) >= of_plant))
+    allowed = (label >= of_plant)[..., None] == (np.arange(labels) >= of_plant)
+    hypotheses = bank(plant, even(plant, belief), scenarios, allowed)
     own = own_ceiling(plant.bare, scenarios)
     if own is None:
         return hypotheses
     own = widened(own, plant.bare, plant)
 
     def start(n: int) -> Told:
-        return Told(hypotheses.init(n), own.init(n), sensor, np.zeros(n, np.int64))
+        return Told(hypotheses.init(n), own.init(n), label, np.zeros(n, np.int64))
 
     def update(s: Told, obs: Array) -> tuple[Told, Diagnosis]:
         first, a = hypotheses.update(s.bank, obs)
         second, b = own.update(s.own, obs)
-        told = s.sensor[np.arange(len(s.k)), np.minimum(s.k, s.sensor.shape[1] - 1)]
-        estimate = b.estimate if b.estimate is None else np.where(told[:, None], a.estimate, b.estimate)
-        said = Diagnosis(np.where(told, a.alarm, b.alarm), np.where(told, a.label, b.label), estimate)
-        return Told(first, second, s.sensor, s.k + 1), said
+        now = s.label[np.arange(len(s.k)), np.minimum(s.k, s.label.shape[1] - 1)]
+        told, acts = now >= of_plant, now > 0
+        estimate = None
+        if a.estimate is not None and b.estimate is not None:
+            estimate = np.where(acts[:, None], np.where(told[:, None], a.estimate, b.estimate), plant.healthy)
+        return Told(first, second, s.label, s.k + 1), Diagnosis(acts, np.where(told, a.label, b.label) * acts, estimate)
 
     return Diagnoser(start, update, hypotheses.gaps and own.gaps)
