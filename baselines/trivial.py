@@ -55,8 +55,8 @@ def false_alarm(plant: Plant) -> Diagnoser:
     for i, label in enumerate(plant.labels):
         for mode in plant.modes:
             if mode.name in label.modes:
-                size = mode.reach[0] + 2 / 3 * (mode.reach[1] - mode.reach[0])
-                estimates[i] += np.array(mode.offset) + size * np.array(mode.direction)
+                low, high = mode.reaches.T
+                estimates[i] += np.array(mode.offset) + (low + 2 / 3 * (high - low)) @ mode.directions
     count = max(len(plant.labels) - 1, 1)
 
     def update(state: Array, obs: Array) -> tuple[Array, Diagnosis]:

@@ -4,7 +4,8 @@
                                  [--page leaderboards/sensors.md]
 
 Flights whose sensors fail in one way each, flights with the plant's own standard faults, and healthy ones; the methods know
-the process "mixed". What counts is what is declared at the flight's last sample.
+the process "mixed". What counts is what is declared at the flight's last sample. Sections of other plants that the page has
+stay there.
 """
 
 import argparse
@@ -28,10 +29,11 @@ FIRST = 4_600_000  # seed; neither test nor validation nor training flights
 METHODS = ("augmented_ekf", "multiple_model_ekf", "told_onset_bank")
 INTRODUCTION = """# Sensors that fail
 
-Written by `python benchmarks/sensors.py --page leaderboards/sensors.md`. In each row {flights} flights in which a sensor
-fails in one way (`fdi_gym.sensors` says how much), in which the plant's own standard faults act, or healthy ones; a method
-knows the process "mixed", not which of these it meets, and what counts is what it declares at the flight's last sample.
-`told_onset_bank` is told when the label changes, and starts its hypotheses then. Percent, with 95 % intervals (Clopper and
+Written by `python benchmarks/sensors.py --page leaderboards/sensors.md`. In each row flights in which a sensor fails in one
+way (`fdi_gym.sensors` says how much), in which the plant's own standard faults act, or healthy ones; a method knows the
+process "mixed", not which of these it meets, and what counts is what it declares at the flight's last sample.
+`told_onset_bank` is told when the label changes, and starts its hypotheses then; `told_source_oracle` is also told whether
+a sensor fails. Percent, with 95 % intervals (Clopper and
 Pearson); the delay is the median time from the onset to the alarm of those that are found. "as the plant's" are flights
 whose sensor failed and that are called one of the plant's own faults; for the plant's own faults it is the reverse.
 """
@@ -81,6 +83,12 @@ def study(plant, methods, count):
             yield [name, what, share(label > 0), share(label == truth), f"{delay:.2f} s", share(other)]
 
 
+def sections_of(page):
+    """What a page says of each plant."""
+    parts = page.read_text().split("\n## ")[1:] if page is not None and page.is_file() else []
+    return {name: text.strip() for name, text in (part.split("\n", 1) for part in parts)}
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("plants", nargs="*", default=list(plant_sources()))
@@ -89,14 +97,16 @@ def main():
     parser.add_argument("--page", type=Path)
     arguments = parser.parse_args()
     head = ["method", "what fails", "alarm %", "right label %", "delay", "as the plant's %"]
-    parts = [INTRODUCTION.format(flights=arguments.flights)]
+    sections = sections_of(arguments.page)
     for plant_id in arguments.plants:
         rows = []
         for row in study(load_plant(plant_id, sensor_faults=True), arguments.methods, arguments.flights):
             rows.append(row)
             print(plant_id, *row, flush=True)
-        parts += [f"\n## {plant_id}\n", markdown(head, sorted(rows, key=lambda row: arguments.methods.index(row[0])))]
+        table = markdown(head, sorted(rows, key=lambda row: arguments.methods.index(row[0])))
+        sections[plant_id] = f"{arguments.flights} flights a row.\n\n{table}"
         if arguments.page:
+            parts = [INTRODUCTION, *(f"\n## {name}\n\n{text}" for name, text in sorted(sections.items()))]
             arguments.page.write_text("\n".join(parts).rstrip() + "\n")
 
 

@@ -51,11 +51,11 @@ def accommodated(plant: Plant, label: Array, estimate: Array | None = None) -> A
         deviation = estimate[:, : healthy.shape[1]] - healthy
         usable = np.asarray(np.isfinite(deviation).all(axis=1))
     sizes = own.magnitudes(label, np.where(usable[:, None], deviation, 0.0))
-    for column, mode in enumerate(own.modes):
-        size, low, high = sizes[:, column], *mode.reach
-        has = usable & np.isfinite(size)
-        size = np.full(len(label), (low + high) / 2) if estimate is None else np.clip(size, low, high)
-        healthy[has] += np.array(mode.offset) + size[has, None] * np.array(mode.direction)
+    for mode, which in zip(own.modes, own.magnitudes_of, strict=True):
+        size, (low, high) = sizes[:, which], mode.reaches.T
+        has = usable & np.isfinite(size).all(axis=1)
+        size = np.tile((low + high) / 2, (len(label), 1)) if estimate is None else np.clip(size, low, high)
+        healthy[has] += np.array(mode.offset) + (size[has, :, None] * mode.directions).sum(axis=1)
     return healthy
 
 

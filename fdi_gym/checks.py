@@ -153,17 +153,25 @@ def _wrong_signals(role: str, signals: Sequence[Signal]) -> Iterable[str]:
 def _wrong_mode(mode: FaultMode, n: int) -> Iterable[str]:
     if not callable(mode.size):
         yield f"the mode {mode.name!r} has a function size, not {mode.size!r}"
+    several = any(np.ndim(row) for row in (*mode.direction, *mode.reach))
     for name, length in (("bands", 2), ("offset", n), ("direction", n), ("reach", 2)):
         values = getattr(mode, name)
-        if len(values) != length or not all(is_finite(v) for v in values):
+        rows = values if several and name in ("direction", "reach") else [values]
+        if any(np.ndim(row) != 1 or len(row) != length or not all(map(is_finite, row)) for row in rows):
             yield f"the mode {mode.name!r} has {length} finite numbers in {name}, not {values!r}"
             return
-    for name in ("bands", "reach"):
-        low, high = getattr(mode, name)
-        if low > high:
-            yield f"the mode {mode.name!r} has {name} in rising order, not {(low, high)}"
-    if not any(mode.direction) and not any(mode.offset):
+    if several and len(mode.direction) != len(mode.reach):
+        ranges, directions = len(mode.reach), len(mode.direction)
+        yield f"the mode {mode.name!r} has a range in reach for each direction, not {ranges} for {directions}"
+        return
+    for name, rows in (("bands", [mode.bands]), ("reach", mode.reaches.tolist())):
+        for low, high in rows:
+            if low > high:
+                yield f"the mode {mode.name!r} has {name} in rising order, not {(low, high)}"
+    if not mode.moves.any():
         yield f"the mode {mode.name!r} has an offset or a direction that moves something"
+    if several and np.linalg.matrix_rank(mode.directions) < len(mode.directions):
+        yield f"the mode {mode.name!r} has independent directions, not {mode.direction!r}"
 
 
 def _wrong_acting(plant: Plant, acting: Acting) -> Iterable[str]:

@@ -44,8 +44,10 @@ class FaultMode(NamedTuple):
         bands: Sizes below the first are "small", below the second "medium", else "large".
         offset, direction, reach: The line that the fault spans in the estimated space, as a deviation from healthy:
             offset + m direction with m in reach. A stuck surface has offset -1 in its effectiveness, direction its
-            position. Two faults add their deviations. A fault that is building up is on its way from healthy to there;
-            processes other than "standard" may draw one that stays short of the reach, none beyond it.
+            position. A fault with several magnitudes that move each for itself, such as a gain and a bias, has as many
+            directions, independent ones, and ranges: ((1, 0), (0, 1)) and ((-0.5, 0.5), (-2, 2)) are a plane. Two faults
+            add their deviations. A fault that is building up is on its way from healthy to there; processes other than
+            "standard" may draw one that stays short of the reach, none beyond it.
     """
 
     name: str
@@ -53,8 +55,23 @@ class FaultMode(NamedTuple):
     size: Callable[[Array], Array]
     bands: tuple[float, float]
     offset: tuple[float, ...]
-    direction: tuple[float, ...]
-    reach: tuple[float, float]
+    direction: tuple[float, ...] | tuple[tuple[float, ...], ...]
+    reach: tuple[float, float] | tuple[tuple[float, float], ...]
+
+    @property
+    def directions(self) -> Array:
+        """The direction of each of its magnitudes (f, n)."""
+        return np.atleast_2d(np.array(self.direction, float))
+
+    @property
+    def reaches(self) -> Array:
+        """The ends of each of its magnitudes (f, 2)."""
+        return np.atleast_2d(np.array(self.reach, float))
+
+    @property
+    def moves(self) -> Array:
+        """Which entries of the estimated space it moves (n,) bool."""
+        return np.abs(self.offset) + np.abs(self.directions).sum(axis=0) > 0
 
 
 class Label(NamedTuple):

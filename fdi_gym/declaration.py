@@ -16,7 +16,7 @@ from fdi_gym.plant import Array, Plant
 if TYPE_CHECKING:  # an environment begins without the filters' modules
     from fdi_gym.diagnosis.contract import Decisions
 
-PRESENT, ONSET, END, SIZE, COLUMNS = range(5)  # of a declaration's rows
+PRESENT, ONSET, END, SIZE = range(4)  # of a declaration's rows; from SIZE on one column for each magnitude
 BRIDGED = 20  # samples without an alarm that do not end it, as of an intermittent fault
 SHORTEST = 10  # samples that an alarm must last to be declared
 SHARE, LASTING = 0.5, 0.05  # a mode is declared that so much of its alarm, or of the flight, names
@@ -28,13 +28,21 @@ class Errors(NamedTuple):
     exact: Array  # (n,) bool: the set of modes is the true one
     onset: Array  # (n, modes) declared less true onset, in samples
     overlap: Array  # (n, modes) intersection over union of the declared and the true window
-    size: Array  # (n, modes) declared less true size
+    size: Array  # (n, modes) declared less true size as a share of the reach, of the magnitude that is furthest off
     worth: Array  # (n,) what the declarations are worth, 0 to 1; see `worth`
 
 
-def spans(plant: Plant) -> Array:
-    """The length of each mode's reach (modes,): what an error of its size is compared with."""
-    return np.array([mode.reach[1] - mode.reach[0] for mode in plant.modes])
+def columns(plant: Plant) -> int:
+    """Of a declaration's rows: 4, or more where a mode has more than one magnitude; what is beyond a mode's own is 0."""
+    return SIZE + max((len(which) for which in plant.magnitudes_of), default=1)
+
+
+def bounds(plant: Plant) -> Array:
+    """The ends of the sizes in a declaration's rows (modes, columns - SIZE, 2): the modes' reaches."""
+    found = np.zeros((len(plant.modes), columns(plant) - SIZE, 2))
+    for mode, row in zip(plant.modes, found, strict=True):
+        row[: len(mode.reaches)] = mode.reaches
+    return found
 
 
 def runs(label: Array, first: int = 0, last: int | None = None) -> list[tuple[int, int, int]]:
@@ -62,14 +70,16 @@ Windows = dict[int, list[tuple[int, int]]]  # of each mode: (first sample, sampl
 
 def _windows_to_rows(plant: Plant, windows: Windows, label: Array, estimate: Array | None) -> Array:
     """The rows (modes, 4) of one flight from the windows of each mode, and the estimated quantity (K + 1, n) within them."""
-    rows = np.zeros((len(plant.modes), COLUMNS))
-    reach = np.array([mode.reach for mode in plant.modes], float)
-    size = np.full((len(label), len(rows)), np.nan)
+    rows = np.zeros((len(plant.modes), columns(plant)))
+    reach = plant.reaches
+    size = np.full((len(label), len(reach)), np.nan)
     if estimate is not None:
         size = np.clip(plant.magnitudes(label, estimate - plant.healthy), reach[:, 0], reach[:, 1])
     for i, found in windows.items():
-        settled = _settled(np.concatenate([size[a:b, i] for a, b in found]))
-        rows[i] = 1.0, max(found[0][0] - 1, 0), found[-1][1] - 1, np.mean(reach[i]) if np.isnan(settled) else settled
+        rows[i, :SIZE] = 1.0, max(found[0][0] - 1, 0), found[-1][1] - 1
+        for column, which in enumerate(plant.magnitudes_of[i], SIZE):
+            settled = _settled(np.concatenate([size[a:b, which] for a, b in found]))
+            rows[i, column] = np.mean(reach[which]) if np.isnan(settled) else settled
     return rows
 
 
@@ -83,15 +93,15 @@ def true_rows(plant: Plant, label: Array, target: Array) -> Array:
     found = {i: stretches(np.isin(label, labels)) for i, labels in enumerate(_members(plant))}
     rows = _windows_to_rows(plant, {i: windows for i, windows in found.items() if windows}, label, target)
     if np.isnan(target).all():  # a recorded flight: which faults it had is known, how large they were is not
-        rows[rows[:, PRESENT] > 0, SIZE] = np.nan
+        rows[rows[:, PRESENT] > 0, SIZE:] = np.nan
     return rows
 
 
 def true_declaration(plant: Plant, record: Record) -> Array:
-    """What was true of recorded flights: (N, modes, 4), the columns PRESENT, ONSET, END, SIZE.
+    """What was true of recorded flights: (N, modes, 4), the columns PRESENT, ONSET, END, SIZE; more for planes (`columns`).
 
     Onset and end are steps: a fault acts on onset <= k < end, from the first time to the last. The size is that on the
-    mode's line, the median over the second half of the time in which it acted.
+    mode's line, the median over the second half of the time in which it acted; on a plane it is one for each direction.
     """
     flights = zip(record.label, record.target, record.length, strict=True)
     return np.array([true_rows(plant, label[: last + 1], target[: last + 1]) for label, target, last in flights])
@@ -154,15 +164,18 @@ def errors(plant: Plant, truth: Array, declaration: Array) -> Errors:
     exact, overlap, error = (
         (is_there == is_said).all(axis=-1),
         np.where(both, common / np.maximum(union, 1.0), np.nan),
-        np.where(both, declaration[..., SIZE] - truth[..., SIZE], np.nan),
+        np.where(both[..., None], declaration[..., SIZE:] - truth[..., SIZE:], np.nan),
     )
-    span = spans(plant)
-    right = np.maximum(1.0 - np.abs(error) / np.where(span > 0, span, 1.0), 0.0)
+    low, high = np.moveaxis(bounds(plant), 2, 0)
+    shares = error / np.where(high > low, high - low, 1.0)
+    worst = np.argmax(np.abs(shares), axis=-1)[..., None]
+    share = np.take_along_axis(shares, worst, axis=-1)[..., 0]
+    right = np.maximum(1.0 - np.abs(share), 0.0)
     parts = np.stack([np.ones_like(right), overlap, right]).mean(axis=0)
     parts = np.where(np.isnan(truth[..., SIZE]), 0.5 * (1.0 + overlap), parts)
     mean = np.where(is_there, np.nan_to_num(parts), 0.0).sum(axis=-1) / np.maximum(is_there.sum(axis=-1), 1)
     value = np.where(exact, np.where(is_there.any(axis=-1), mean, 1.0), 0.0)
-    return Errors(exact, np.where(both, b[..., 0] - a[..., 0], np.nan), overlap, error, value)
+    return Errors(exact, np.where(both, b[..., 0] - a[..., 0], np.nan), overlap, share, value)
 
 
 def worth(plant: Plant, truth: Array, declaration: Array) -> Array:

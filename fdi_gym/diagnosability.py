@@ -8,7 +8,7 @@ G(t) = sum of V' S^-1 V up to t, V the signature, is the Fisher information abou
   (z - q)' G (z - q) over that label's q, in nats. It is the mean of the log likelihood ratio by which the best test tells
   the two apart, and that test errs in one case of 20 at NEEDED nats. From "none" it is z' G z / 2;
 - the Cramer-Rao bound of a mode's magnitude m along its direction d, its onset known and nothing else at fault: the standard
-  deviation 1 / sqrt(d' G d) that no unbiased estimate goes below.
+  deviation 1 / sqrt(d' G d) that no unbiased estimate goes below; on a plane D, the root of the diagonal of (D G D')^-1.
 
 A fault is never told from a label that holds it (a second fault of size 0, where its reach has that): only the price of the
 second fault speaks against such a label. Both measures hold for a known onset and a linear model: methods that are told
@@ -53,11 +53,11 @@ class Diagnosability(NamedTuple):
     process: str
     labels: tuple[str, ...]  # all; the first is "none"
     faults: Array  # (labels,) how many simultaneous faults each has
-    modes: tuple[str, ...]
-    unit: tuple[str, ...]  # of each mode's magnitude
+    magnitudes: tuple[str, ...]  # the mode, and of planes the entry
+    unit: tuple[str, ...]  # of each magnitude
     seconds: Array  # (T,) since onset
     divergence: Array  # (T, labels - 1, sizes, labels) nats: median over flights; NaN of a label with itself
-    bound: Array  # (T, modes) standard deviation of the magnitude; median over flights
+    bound: Array  # (T, magnitudes) standard deviation; median over flights
 
     def told_apart(self) -> Array:
         """Seconds until each fault is told from each label (labels - 1, sizes, labels): inf for never, NaN as above."""
@@ -110,9 +110,9 @@ class Diagnosability(NamedTuple):
                 lines.append(f"{self.labels[i + 1]:{wide}s}{row}")
         when = np.unique(np.linspace(0, len(self.seconds) - 1, 4).astype(int))
         head = "".join(f"{f'{self.seconds[k]:.3g} s':>12s}" for k in when)
-        wide = max(len(name) for name in (*self.modes, "mode"))
+        wide = max(len(name) for name in (*self.magnitudes, "mode"))
         lines += ["", "least standard deviation of a magnitude, its mode and onset known", "", f"{'mode':{wide}s}{head}"]
-        for i, (mode, unit) in enumerate(zip(self.modes, self.unit, strict=True)):
+        for i, (mode, unit) in enumerate(zip(self.magnitudes, self.unit, strict=True)):
             cells = "".join(f"{self.bound[k, i]:12.3g}" for k in when)
             lines.append(f"{mode:{wide}s}{cells} {unit}")
         return "\n".join(line.rstrip() for line in lines)
@@ -132,7 +132,7 @@ class Diagnosability(NamedTuple):
         left.set_yticks(range(n), self.labels[1:], fontsize=7)
         left.set_title(f"told from, {self.seconds[-1]:.3g} s after onset", fontsize=9)
         figure.colorbar(shown, ax=left, label=f"log10 of nats / {NEEDED:.1f}")
-        for i, mode in enumerate(self.modes):
+        for i, mode in enumerate(self.magnitudes):
             right.loglog(self.seconds, self.bound[:, i], label=f"{mode} [{self.unit[i]}]" if self.unit[i] else mode)
         right.set(xlabel="s since onset", title="Cramer-Rao bound of each magnitude")
         right.legend(fontsize=7, frameon=False)
@@ -141,24 +141,27 @@ class Diagnosability(NamedTuple):
 
 
 def drawn(plant: Plant, process: str) -> list[Array]:
-    """The magnitudes that a process gives each mode, those of its reach where it draws none: by size."""
+    """The magnitudes (count, f) that a process gives each mode, those of its reach where it draws none: by size."""
     scenarios = [draw(plant.process(process), VALIDATION_SEED + FIRST + i) for i in range(DRAWN)]
     record = simulate(plant, scenarios)
     flown = np.arange(record.label.shape[1]) <= record.length[:, None]
     found = plant.magnitudes(np.where(flown, record.label, 0), record.target - plant.healthy)
     out = []
-    for i, mode in enumerate(plant.modes):
-        values = np.unique(found[..., i][np.isfinite(found[..., i])])
-        values = values[(values >= mode.reach[0]) & (values <= mode.reach[1])]
-        values = values if values.size else np.linspace(*mode.reach, 100)
-        out.append(values[np.argsort(np.abs(values))])
+    for mode, which in zip(plant.modes, plant.magnitudes_of, strict=True):
+        low, high = mode.reaches.T
+        own = found[..., which]
+        values = np.unique(own[np.isfinite(own).all(axis=-1)], axis=0)
+        values = values[((values >= low) & (values <= high)).all(axis=1)]
+        values = values if len(values) else np.linspace(low, high, 100)
+        sizes = np.abs(values) / np.where(high > low, high - low, 1.0)
+        out.append(values[np.argsort(sizes.max(axis=1))])
     return out
 
 
-def of_size(values: Array, size: float) -> tuple[float, float]:
-    """The magnitude at a quantile of those that are drawn (sorted by size); twice, with both signs where both are drawn."""
-    m = float(values[int(size * (len(values) - 1))])
-    return (m, -m) if values.min() < 0 < values.max() else (m, m)
+def of_size(values: Array, size: float) -> tuple[Array, Array]:
+    """The magnitudes (f,) at a quantile of those drawn (count, f), by size; twice, with both signs where both are."""
+    m = values[int(size * (len(values) - 1))]
+    return m, np.where((values.min(axis=0) < 0) & (values.max(axis=0) > 0), -m, m)
 
 
 def information(
@@ -248,7 +251,7 @@ def diagnosability(
         for s, size in enumerate(SIZES):
             nats = []
             for sign in (0, 1):
-                parts = [np.array(mode.offset) + of_size(values, size)[sign] * np.array(mode.direction)
+                parts = [np.array(mode.offset) + of_size(values, size)[sign] @ mode.directions
                          for mode, values in (sizes[name] for name in sorted(label.modes))]  # fmt: skip
                 z = np.sum(parts, axis=0)[which]
                 Gz = flat @ z
@@ -259,14 +262,24 @@ def diagnosability(
                 nats.append(0.5 * np.maximum(all_labels, 0.0).reshape(count, n, -1))
             found[:, i, s] = np.median(np.mean(nats, axis=0), axis=1)
             found[:, i, s, i + 1] = np.nan
-    directions = np.array([mode.direction for mode in plant.modes])[:, which]
-    power = np.einsum("mp,tnpq,mq->tnm", directions, G, directions)
-    with np.errstate(divide="ignore"):
-        bound = np.median(1.0 / np.sqrt(np.maximum(power, 0.0)), axis=1)
-    unit = tuple(plant.estimated[int(np.argmax(np.abs(mode.direction)))].unit for mode in plant.modes)
+    bound = np.concatenate([_bound(mode.directions[:, which], G) for mode in plant.modes], axis=1)
+    entries = [(mode, plant.estimated[i]) for mode in plant.modes for i in np.argmax(np.abs(mode.directions), axis=1)]
     faults = np.array([len(label.modes) for label in plant.labels])
     return Diagnosability(
         plant.env_id, process, tuple(label.name for label in plant.labels), faults,
-        plant.mode_names, unit, times * plant.dt,
-        found, bound,
+        tuple(f"{mode.name} {entry.name}" if len(mode.directions) > 1 else mode.name for mode, entry in entries),
+        tuple(entry.unit for _, entry in entries), times * plant.dt, found, bound,
     )  # fmt: skip
+
+
+def _bound(directions: Array, G: Array) -> Array:
+    """The Cramer-Rao bounds (T, f) of magnitudes along directions (f, p) from informations (T, n, p, p): medians."""
+    power, f = directions @ G @ directions.T, len(directions)
+    left = np.empty(power.shape[:3])  # of the information about each, when the others are not known
+    for i in range(f):
+        rest = [j for j in range(f) if j != i]
+        both = power[..., i : i + 1, rest]
+        taken = both @ np.linalg.pinv(power[..., rest, :][..., rest], hermitian=True) @ T(both)
+        left[..., i] = power[..., i, i] - taken[..., 0, 0]
+    with np.errstate(divide="ignore"):
+        return np.median(1.0 / np.sqrt(np.maximum(left, 0.0)), axis=1)

@@ -15,7 +15,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from fdi_gym.declaration import PRESENT, declared_rows, errors, runs, spans, true_rows
+from fdi_gym.declaration import PRESENT, declared_rows, errors, runs, true_rows
 from fdi_gym.diagnosis import Decisions
 from fdi_gym.engine import Record
 from fdi_gym.faults import Scoring
@@ -232,12 +232,12 @@ def _stated(error: Array, std: Array, during: Array) -> list[Stated]:
 def _declaration(plant: Plant, label: Array, target: Array, said: Array, estimate: Array | None) -> Declaration:
     """Of one flight, from its samples 0..length."""
     truth, declared = true_rows(plant, label, target)[None], declared_rows(plant, said, estimate)[None]
-    wrong, span = errors(plant, truth, declared), spans(plant)
+    wrong = errors(plant, truth, declared)
     both = np.flatnonzero(np.isfinite(wrong.onset[0]))
     return Declaration(
         int(truth[0, :, PRESENT].sum()), bool(wrong.exact[0]), float(wrong.worth[0]),
         [Found(int(wrong.onset[0, i]), float(wrong.overlap[0, i]), None if np.isnan(wrong.size[0, i])
-               else float(wrong.size[0, i] / span[i] if span[i] else 0.0)) for i in both],
+               else float(wrong.size[0, i])) for i in both],
     )  # fmt: skip
 
 

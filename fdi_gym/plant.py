@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -226,25 +227,41 @@ class Plant(Truth):
         return self.estimate_target(self.nominal_theta, self.trim_command)
 
     def magnitudes(self, label: Array, deviation: Array) -> Array:
-        """How far along its line each mode of a label is (..., modes); NaN where the label does not have it.
+        """How far along its directions each mode of a label is (..., n_magnitudes); NaN where the label does not have it.
 
-        Where the lines of a label's modes share a direction, the least magnitudes that explain the deviation.
+        Where the directions of a label's modes are not independent, the least magnitudes that explain the deviation.
 
         Args:
             label: Label indices (...); others than the plant's have no modes.
             deviation: Of the estimated quantity from healthy (..., n).
         """
-        found = np.full((*label.shape, len(self.modes)), np.nan)
+        found = np.full((*label.shape, self.n_magnitudes), np.nan)
         for index, of in enumerate(self.labels):
             active = [i for i, mode in enumerate(self.modes) if mode.name in of.modes]
             mine = label == index
             if active and mine.any():
                 offset = np.sum([self.modes[i].offset for i in active], axis=0)
-                D = np.transpose([self.modes[i].direction for i in active])
+                D = np.concatenate([self.modes[i].directions for i in active]).T
                 values = (deviation[mine] - offset) @ np.linalg.pinv(D).T
-                for column, i in enumerate(active):
+                for column, i in enumerate(np.concatenate([self.magnitudes_of[i] for i in active]).tolist()):
                     found[mine, i] = values[:, column]
         return found
+
+    @functools.cached_property
+    def magnitudes_of(self) -> tuple[Array, ...]:
+        """The positions of each mode's magnitudes (f,) among those of all modes, which follow one another."""
+        counts = [len(mode.directions) for mode in self.modes]
+        return tuple(np.arange(end - count, end) for count, end in zip(counts, itertools.accumulate(counts), strict=True))
+
+    @property
+    def n_magnitudes(self) -> int:
+        """How many magnitudes all modes have together: one each, more where they are planes."""
+        return sum(len(which) for which in self.magnitudes_of)
+
+    @functools.cached_property
+    def reaches(self) -> Array:
+        """The ends of all magnitudes (n_magnitudes, 2)."""
+        return np.concatenate([np.zeros((0, 2)), *(mode.reaches for mode in self.modes)])
 
     @functools.cached_property
     def theta_entries(self) -> tuple[str, ...]:

@@ -116,7 +116,10 @@ def _modes(plant: Plant, entries: tuple[Signal, ...]) -> list[FaultMode]:
     """The plant's, and one for each sensor: the line of its bias."""
     own, n_y, n = len(plant.theta), len(plant.outputs), len(plant.estimated)
     zeros = (0.0,) * n_y
-    found = [m._replace(offset=(*m.offset, *zeros), direction=(*m.direction, *zeros)) for m in plant.modes]
+    found = []
+    for m in plant.modes:
+        rows = tuple((*row, *zeros) for row in m.directions.tolist())
+        found.append(m._replace(offset=(*m.offset, *zeros), direction=rows if np.ndim(m.direction) == 2 else rows[0]))
     names = [s.name for s in plant.outputs]
     for s in failing(plant):
         i = names.index(s.name)

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiBinary, Space
 
-from fdi_gym.declaration import COLUMNS, END, ONSET, PRESENT, SIZE, worth
+from fdi_gym.declaration import END, ONSET, PRESENT, SIZE, bounds, columns, worth
 from fdi_gym.plant import Array, Plant
 
 
@@ -222,7 +222,7 @@ class Scenario(_Boxed):
 
     The first is yes from 0.5 on; onset and end are shares of the flight; the size lies in the mode's reach. Each action is
     the declaration so far, and the last one of the episode counts: see `fdi_gym.declaration.worth`. The answer has a row
-    (present, onset, end, size) for each mode.
+    (present, onset, end, size) for each mode; where a mode is a plane, a size for each of its directions.
     """
 
     name = "scenario"
@@ -230,13 +230,14 @@ class Scenario(_Boxed):
 
     def __init__(self, plant: Plant, scaled: bool):
         super().__init__(plant, scaled)
-        low, high = np.zeros((len(plant.modes), COLUMNS)), np.ones((len(plant.modes), COLUMNS))
-        low[:, SIZE], high[:, SIZE] = np.transpose([mode.reach for mode in plant.modes])
+        self.rows = len(plant.modes), columns(plant)
+        low, high = np.zeros(self.rows), np.ones(self.rows)
+        low[:, SIZE:], high[:, SIZE:] = np.moveaxis(bounds(plant), 2, 0)
         self._bounded(low.ravel(), high.ravel())
 
     def check(self, action: Any, shape: tuple[int, ...]) -> Array:
         """As `Task.check`."""
-        return self._physical(action, shape).reshape(*shape, len(self.plant.modes), COLUMNS)
+        return self._physical(action, shape).reshape(*shape, *self.rows)
 
     def worth(self, answer: Array, truth: Array, length: Array) -> Array:
         """As `Task.worth`."""
@@ -248,10 +249,9 @@ class Scenario(_Boxed):
         """The action that makes a declaration (n, modes, 4) of flights of these lengths (n,)."""
         value = declaration.astype(float)
         value[..., ONSET : END + 1] /= np.asarray(length)[..., None, None]
+        low = self.low.reshape(self.rows)
+        value[..., SIZE:] = np.where(value[..., PRESENT, None] >= 0.5, value[..., SIZE:], low[:, SIZE:])
         value = value.reshape(*value.shape[:-2], -1)
-        value[..., SIZE::COLUMNS] = np.where(
-            value[..., PRESENT::COLUMNS] >= 0.5, value[..., SIZE::COLUMNS], self.low[SIZE::COLUMNS]
-        )
         if self.scaled:
             value = scaled(value, self.low, self.high).astype(np.float32)
         return value

@@ -267,7 +267,7 @@ def test_boxed_least_squares_with_two_faults():
     root = rng.standard_normal((4, 4))
     I, z = (root @ root.T)[None], rng.normal(0, 1, (1, 4))  # noqa: E741
     J, m = distances(z, np.linalg.inv(I), sets)
-    for h in np.flatnonzero(sets.faults == 2):
+    for h in np.flatnonzero(sets.magnitudes == 2):
         axes = [np.linspace(sets.low[h, i], sets.high[h, i], 401) for i in range(2)]
         grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
         q = z - sets.offset[h] - grid @ sets.direction[h].T

@@ -97,9 +97,9 @@ def test_agrees_in_order_with_the_confusions_of_good_methods(found, row):
 def test_sizes_are_those_that_the_process_draws(b747):
     values = drawn(b747, "standard")
     for mode, own in zip(b747.modes, values, strict=True):
-        assert (own >= mode.reach[0]).all()
-        assert (own <= mode.reach[1]).all()
-        assert (np.diff(np.abs(own)) >= 0).all()
+        assert (own >= mode.reaches[:, 0]).all()
+        assert (own <= mode.reaches[:, 1]).all()
+        assert (np.diff(np.abs(own), axis=0) >= 0).all()
     assert of_size(values[0], 0.0) == (values[0][0], values[0][0])
     first = of_size(values[1], 0.5)
     assert first[0] == -first[1]
@@ -111,7 +111,7 @@ def test_every_plant(plant):
     found = diagnosability(plant, belief=belief_of(plant), flights=2, seconds=60 * dt)
     assert np.allclose(found.confusions().sum(axis=1), 1.0)
     assert np.isfinite(found.bound[-1]).any()
-    for name in (*found.labels, *found.modes):
+    for name in (*found.labels, *found.magnitudes):
         assert name in found.text()
 
 

@@ -79,6 +79,27 @@ def test_the_ceiling_names_nearly_all():
     assert (run(told, shown).label[:, -1] == true).mean() > 0.9
 
 
+@pytest.mark.parametrize("kind", ["drift", "freeze", "plant"])
+def test_told_the_source_nothing_of_a_sensor_is_taken_for_the_plants_nor_the_other_way_round(kind):
+    """At every sample from the onset on; and nine in ten flights' ends are right, a frozen reading's all."""
+    plant = sick()
+    if kind == "plant":
+        scenarios = [s for s in (draw(plant.bare.process("standard"), FIRST + i) for i in range(2 * FLIGHTS)) if s.faults]
+        record = simulate(plant, scenarios)
+    else:
+        scenarios, record = flown(kind)
+    said = run(make_diagnoser("told_source_oracle", plant, process="mixed", scenarios=scenarios), record.obs)
+    own = len(plant.bare.labels)
+    acts = record.label > 0
+    assert ((said.label >= own) == (record.label >= own))[acts].all()
+    assert not said.label[~acts].any()
+    right = said.label[:, -1] == record.label[:, -1]
+    assert right.mean() >= (1.0 if kind == "freeze" else 0.9)
+    assert np.isfinite(said.estimate).all()
+    with pytest.raises(NotApplicableError, match="no label of B747Lateral is a sensor's fault"):
+        make_diagnoser("told_source_oracle", plant.bare, scenarios=scenarios)
+
+
 def test_a_method_that_is_not_told_goes_by_the_plant_without():
     plant, (scenarios, record) = sick(), flown("bias")
     told = make_diagnoser("two_stage_kf", plant.bare)
@@ -121,7 +142,9 @@ def test_dropout_raises_no_more_alarms(name):
     assert plant.regular.options == build("B747Lateral").options  # what it knows was found without dropout
 
 
-@pytest.mark.parametrize("name", ["augmented_ekf", "multiple_model_ekf", "told_onset_bank", "two_stage_kf"])
+@pytest.mark.parametrize(
+    "name", ["augmented_ekf", "multiple_model_ekf", "told_onset_bank", "told_source_oracle", "two_stage_kf"]
+)
 def test_the_laws_of_diagnosers_hold_where_sensors_may_fail(name):
     check_diagnoser(lambda p, s: make_diagnoser(name, p, process="mixed", scenarios=s), sick())
 

@@ -37,12 +37,10 @@ class Hypotheses(NamedTuple):
 
 
 def transitions(sets: Array, one_more: float, one_less: float) -> Array:
-    """Pi(i -> j) (L, L): to each hypothesis with one channel more or less; 0 for other changes; the rest stays."""
-    sizes = sets.sum(axis=1)
-    subset = ~(sets[:, None] & ~sets[None]).any(axis=2)  # i within j
-    Pi = one_more * (subset & (sizes[None] == sizes[:, None] + 1)) + one_less * (
-        subset.T & (sizes[None] == sizes[:, None] - 1)
-    )
+    """Pi(i -> j) (L, L): to each hypothesis with one fault more or less; 0 for other changes; the rest stays."""
+    within = ~(sets[:, None] & ~sets[None]).any(axis=2) & ~np.eye(len(sets), dtype=bool)  # i within j
+    one = within & ~((within[:, :, None] & within[None]).any(axis=1))  # and nothing between them
+    Pi = one_more * one + one_less * one.T
     return Pi + np.diag(1 - Pi.sum(axis=1))
 
 

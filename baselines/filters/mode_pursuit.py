@@ -16,7 +16,7 @@ from fdi_gym.diagnosis import Diagnoser, diagnoser, diagnoser_of
 from fdi_gym.estimation.augmented import augmented
 from fdi_gym.estimation.automaton import Automaton
 from fdi_gym.estimation.belief import Belief
-from fdi_gym.estimation.calibration import LEAST, Calibration
+from fdi_gym.estimation.calibration import Calibration, least
 from fdi_gym.estimation.decision import Evidence, Reading, Rule, Verdict, declare, undeclared
 from fdi_gym.plant import Array, Plant
 
@@ -24,11 +24,14 @@ MOST = 3  # modes at once
 
 
 class Lines:
-    """The lines of a plant's modes in the estimated space."""
+    """The lines and planes of a plant's modes in the estimated space; beyond a mode's own directions there are zeros."""
 
     def __init__(self, plant: Plant):
         self.offset = np.array([mode.offset for mode in plant.modes])  # (modes, p)
-        self.direction = np.array([mode.direction for mode in plant.modes])  # (modes, p)
+        most = max(len(which) for which in plant.magnitudes_of)
+        self.directions = np.zeros((len(plant.modes), most, len(plant.estimated)))  # (modes, f, p)
+        for mode, rows in zip(plant.modes, self.directions, strict=True):
+            rows[: len(mode.directions)] = mode.directions
 
     def pursue(self, z: Array, I: Array, threshold: Array) -> tuple[Array, Array]:  # noqa: E741
         """Modes that explain z.
@@ -41,7 +44,7 @@ class Lines:
         Returns:
             How much each gained when it was added, 0 for those that were not (n, modes), and the gain of each alone.
         """
-        n, modes = len(z), len(self.offset)
+        n, (modes, f, _) = len(z), self.directions.shape
         gained, alone = np.zeros((n, modes)), np.zeros((n, modes))
         chosen, left = np.zeros((n, 0, z.shape[1])), z.copy()
         cost = np.einsum("np,npq,nq->n", z, I, z)
@@ -49,12 +52,12 @@ class Lines:
         for count in range(MOST):
             b = left[:, None] - self.offset  # (n, modes, p)
             D = np.concatenate([
-                np.broadcast_to(chosen[:, None], (n, modes, count, z.shape[1])),
-                np.broadcast_to(self.direction[:, None], (n, modes, 1, z.shape[1])),
+                np.broadcast_to(chosen[:, None], (n, modes, count * f, z.shape[1])),
+                np.broadcast_to(self.directions, (n, modes, f, z.shape[1])),
             ], axis=2)  # fmt: skip
             DI = D @ I[:, None]
             A = DI @ np.swapaxes(D, 2, 3)
-            A = A + 1e-9 * (np.einsum("nmaa->nm", A)[..., None, None] + 1e-300) * np.eye(count + 1)
+            A = A + 1e-9 * (np.einsum("nmaa->nm", A)[..., None, None] + 1e-300) * np.eye(count * f + f)
             m = np.linalg.solve(A, DI @ b[..., None])
             r = b - (m * D).sum(axis=2)
             gain = cost[:, None] - np.einsum("nmp,npq,nmq->nm", r, I, r)
@@ -68,7 +71,7 @@ class Lines:
             gained[going, best[going]] = most[going]
             left = np.where(going[:, None], left - self.offset[best], left)
             cost = np.where(going, cost - most, cost)
-            chosen = np.concatenate([chosen, np.where(going[:, None], self.direction[best], 0.0)[:, None]], axis=1)
+            chosen = np.concatenate([chosen, np.where(going[:, None, None], self.directions[best], 0.0)], axis=1)
         return gained, alone
 
 
@@ -80,7 +83,7 @@ def by_modes(plant: Plant, calibration: Calibration) -> Rule:
     """
     calibration.penalties(plant)
     lines, after, modes = Lines(plant), calibration.persistence, len(plant.modes)
-    threshold = np.array([calibration.thresholds.get(mode.name, LEAST) for mode in plant.modes])
+    threshold = np.array([calibration.thresholds.get(mode.name, least(mode)) for mode in plant.modes])
     sets = plant.modes_of(np.arange(len(plant.labels)))
     single = _labels(sets, np.eye(modes, dtype=bool))
     p = len(plant.estimated)

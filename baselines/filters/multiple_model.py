@@ -1,7 +1,7 @@
 """Interacting multiple models for any plant: one extended Kalman filter per label, with the magnitudes of its own faults.
 
-Model j has the fault vector on the line of label j: theta = healthy + offset_j + D_j m, and the state [x; m; d]. The
-label is a Markov chain; between samples the models exchange state and disturbance in proportion to the probability that
+Model j has the fault vector on the line, or plane, of label j: theta = healthy + offset_j + D_j m, and the state [x; m; d].
+The label is a Markov chain; between samples the models exchange state and disturbance in proportion to the probability that
 the label has just changed, and a model that was not in force has the magnitude's prior back. The likelihoods of the
 innovations give the probabilities of the labels; the label is the one whose probability beats the calibrated thresholds.
 
@@ -21,6 +21,7 @@ from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_labels
 from fdi_gym.estimation.interval import Interval
+from fdi_gym.estimation.labels import magnitudes_of_labels
 from fdi_gym.plant import Array, Plant
 
 SMALLEST_MAGNITUDE, SLOWEST_WALK = 0.05, 1e-3  # standard deviations, in units of the mode's root mean square
@@ -44,18 +45,22 @@ def hypotheses(plant: Plant, belief: Belief) -> Hypotheses:
     """
     base, p = augmented(plant, belief), belief
     labels, n_x = len(plant.labels), len(plant.states)
-    width = max(1, *(len(label.modes) for label in plant.labels))
+    width = max(1, *magnitudes_of_labels(plant).tolist())
     number = {mode.name: i for i, mode in enumerate(plant.modes)}
     typical = np.sqrt(p.m_mean**2 + p.m_std**2)
     offset, direction = np.zeros((labels, len(p.z_size))), np.zeros((labels, len(p.z_size), width))
     m0, M0, walk = np.zeros((labels, width)), np.zeros((labels, width, width)), np.zeros((labels, width))
     for j, label in enumerate(plant.labels):
-        for f, i in enumerate(sorted(number[name] for name in label.modes)):
-            mode = plant.modes[i]
-            offset[j] += mode.offset
-            direction[j, :, f] = mode.direction
-            m0[j, f], walk[j, f] = p.m_mean[i], max(p.m_walk[i], SLOWEST_WALK * typical[i]) ** 2
-            M0[j, f, f] = max(p.m_std[i], SMALLEST_MAGNITUDE * typical[i]) ** 2
+        active = sorted(number[name] for name in label.modes)
+        for i in active:
+            offset[j] += plant.modes[i].offset
+        lines = [
+            (line, k) for i in active for line, k in zip(plant.modes[i].directions, plant.magnitudes_of[i], strict=True)
+        ]
+        for f, (line, k) in enumerate(lines):
+            direction[j, :, f] = line
+            m0[j, f], walk[j, f] = p.m_mean[k], max(p.m_walk[k], SLOWEST_WALK * typical[k]) ** 2
+            M0[j, f, f] = max(p.m_std[k], SMALLEST_MAGNITUDE * typical[k]) ** 2
     N = n_x + width + len(p.disturbances)
     z, d = slice(n_x, n_x + width), slice(n_x + width, N)
     rest = base.rest

@@ -84,7 +84,7 @@ def grouped(plant: Plant, model: AugmentedModel, size: Array, groups: Sequence[S
         about.h(X, at).E * size / np.sqrt(np.diag(model.R))[:, None],
     )
     moves_state, moves_sensor = np.abs(E).max(axis=(0, 1)) > TINY, np.abs(H).max(axis=0).T > TINY  # (p,), (p, m)
-    entries = {mode.name: (np.abs(mode.offset) + np.abs(mode.direction))[model.inputs.estimated] > 0 for mode in plant.modes}
+    entries = {mode.name: mode.moves[model.inputs.estimated] for mode in plant.modes}
     of_label = np.full(len(plant.labels), -1)
     for index, label in enumerate(plant.labels):
         moved = np.any([entries[name] for name in label.modes], axis=0) if label.modes else np.zeros(len(size), bool)

@@ -101,7 +101,7 @@ def existing(plant: Plant, model: AugmentedModel, size: Array) -> Observers:
     E = np.concatenate([f.E[:, :n_x], f.A[:, :n_x, n_x:]], axis=2) * inputs / x[:, None]
     H = np.concatenate([h.E, np.zeros((2, len(y), q))], axis=2) * inputs / y[:, None]
     A, C = f.A[:, :n_x, :n_x] * x / x[:, None], h.A[..., :n_x] * x / y[:, None]
-    moved = {mode.name: np.abs(mode.offset) + np.abs(mode.direction) > 0 for mode in plant.modes}
+    moved = {mode.name: mode.moves for mode in plant.modes}
     labels, blind, reasons = [], [], {}
     for index, label in enumerate(plant.labels):
         faults = np.any([moved[name] for name in label.modes], axis=0) if label.modes else np.zeros(len(size), bool)

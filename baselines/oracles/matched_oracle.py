@@ -164,6 +164,10 @@ def matched_oracle(
     """
     if plant.target is None:
         raise NotApplicableError(f"needs faults that are errors of commands; those of {plant.id} are not")
+    if plant.n_magnitudes > len(plant.modes):
+        raise NotApplicableError(
+            f"needs faults that are errors of one command each; {plant.id} has some of several magnitudes"
+        )
     inputs = fault_inputs(plant)
     model = steady_filter(plant, inputs, d_step)
     p, N, n_x, m = len(inputs.names), len(model.A), len(plant.states), len(model.H)

@@ -90,8 +90,10 @@ class Bank(NamedTuple):
     changes: Array  # (n, K + 1) bool
     acts: Array  # (n, K + 1) bool
     course: Array  # (n, K + 1) size of what acts, as a share of its largest; (n, 1) where that is not told
+    allowed: Array  # (n, K + 1, labels) bool: which can be; (n, 1, labels) where that is not told
     now: Array  # (n,) bool: a fault acts
     share: Array  # (n,) of the course
+    among: Array  # (n, labels) bool, of the allowed
     nu: Array  # (n, m) innovation of the healthy filter
     S: Array  # (n, m, m) its covariance
     checks: Checks | None
@@ -113,10 +115,12 @@ def told_onset_bank(plant: Plant, belief: Belief, *, scenarios: Sequence[FaultSc
     Raises:
         ValueError (from init): The number of episodes is not that of the scenarios.
     """
-    return told_bank(plant, rows(plant, belief), scenarios, None)
+    return told_bank(plant, rows(plant, belief), scenarios)
 
 
-def told_bank(plant: Plant, r: Rows, scenarios: Sequence[FaultScenario], course: Array | None) -> Diagnoser:
+def told_bank(
+    plant: Plant, r: Rows, scenarios: Sequence[FaultScenario], course: Array | None = None, allowed: Array | None = None
+) -> Diagnoser:
     """The bank, told of n flights.
 
     Args:
@@ -124,6 +128,7 @@ def told_bank(plant: Plant, r: Rows, scenarios: Sequence[FaultScenario], course:
         r: Its hypotheses.
         scenarios: n of them.
         course: (n, K + 1) by which the hypotheses' lines are scaled at each sample; None: they keep their lengths.
+        allowed: (n, K + 1, labels) which labels can be at each sample; None: all.
     """
     model, z, x, count = r.model, r.model.z, r.model.x, len(r.label)
     N, m, labels = len(model.scale), r.R.shape[-1], len(plant.labels)
@@ -135,9 +140,11 @@ def told_bank(plant: Plant, r: Rows, scenarios: Sequence[FaultScenario], course:
     def start(n: int) -> Bank:
         changes, acts = label_changes(plant, scenarios, n)
         X, P = np.tile(model.X0, (n, count, 1)), np.tile(model.P0, (n, count, 1, 1))
+        every = np.ones((n, labels), bool)
         return Bank(
-            X, P, np.zeros((n, count)), changes, acts, np.ones((n, 1)) if course is None else course, np.zeros(n, bool),
-            np.ones(n), np.zeros((n, m)), np.tile(r.R[0], (n, 1, 1)), None if checks is None else checks.start(n),
+            X, P, np.zeros((n, count)), changes, acts, np.ones((n, 1)) if course is None else course,
+            every[:, None] if allowed is None else allowed, np.zeros(n, bool), np.ones(n), every, np.zeros((n, m)),
+            np.tile(r.R[0], (n, 1, 1)), None if checks is None else checks.start(n),
         )  # fmt: skip
 
     def sized(share: Array) -> AugmentedModel:
@@ -160,7 +167,8 @@ def told_bank(plant: Plant, r: Rows, scenarios: Sequence[FaultScenario], course:
         P[changed, :, :, z] = 0.0
         P[..., z, z] = np.where(changed[:, None, None, None], r.M0, P[..., z, z])
         X1, P1 = sized(share).predict("extended", X.reshape(-1, N), P.reshape(-1, N, N), at)
-        return s._replace(X=X1.reshape(n, count, N), P=P1.reshape(n, count, N, N), log=log, now=now, share=share)
+        s = s._replace(share=share, among=s.allowed[each, np.minimum(k, s.allowed.shape[1] - 1)])
+        return s._replace(X=X1.reshape(n, count, N), P=P1.reshape(n, count, N, N), log=log, now=now)
 
     def update(s: Bank, at: Interval, y: Array, seen: Array) -> Bank:
         n = len(s.now)
@@ -181,7 +189,9 @@ def told_bank(plant: Plant, r: Rows, scenarios: Sequence[FaultScenario], course:
             by_label[:, label] = logsumexp(log[:, r.label == label], axis=1)
         if checks is not None and s.checks is not None:
             gain = checks.repeated(s.checks)
-            by_label = np.where(gain > 0, np.maximum(by_label, s.log[:, :1] + 0.5 * gain), by_label)
+            least = s.log[:, :1] if allowed is None else s.log.max(axis=1, keepdims=True)  # the reading itself was certain
+            by_label = np.where(gain > 0, np.maximum(by_label, least + 0.5 * gain), by_label)
+        by_label[~s.among] = -np.inf
         by_label[~s.now] = -np.inf
         by_label[~s.now, 0] = 0.0
         probs = np.exp(by_label - logsumexp(by_label, axis=1, keepdims=True))

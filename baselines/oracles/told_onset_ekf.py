@@ -18,11 +18,11 @@ from fdi_gym.estimation.augmented import augmented
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.decision import Reading, by_candidate
 from fdi_gym.estimation.interval import Interval
-from fdi_gym.estimation.labels import distances, manifolds
+from fdi_gym.estimation.labels import distances, magnitudes_of_labels, manifolds
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant
 
-PER_FAULT = 3.84  # what each simultaneous fault must gain in fit: the 95 % point of one degree of freedom
+PER_MAGNITUDE = 3.84  # what each magnitude must gain in fit: the 95 % point of one degree of freedom
 
 
 class Told(NamedTuple):
@@ -69,7 +69,7 @@ def told_onset_ekf(plant: Plant, belief: Belief, *, scenarios: Sequence[FaultSce
     model = augmented(plant, belief, walk=walk)
     plain, sets, z = gaussian_filter(model, "extended"), manifolds(plant), model.z
     opened = np.diag(belief.z_size**2)
-    extra = PER_FAULT * np.array([len(label.modes) for label in plant.labels])
+    extra = PER_MAGNITUDE * magnitudes_of_labels(plant)
 
     def start(n: int) -> Told:
         changes, acts = label_changes(plant, scenarios, n)

@@ -13,6 +13,7 @@ from fdi_gym.commands.arguments import Backend, Cluster, Names
 def fit(
     plant: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PLANT")],
     diagnosers: Names = ("all",),
+    suites: tuple[str, ...] = (),
     jobs: int = -1,
     output: Path | None = None,
     renew: bool = False,
@@ -27,6 +28,7 @@ def fit(
         plant: Plant or environment id; "module:id" where the module registers it.
         diagnosers: Names; "reference" for those that others are compared with first, "all" for every one that takes any.
             What the file holds of others stays where names are given, as long as the plant's code is the one that it is of.
+        suites: For these suites alone; what the file holds for others stays then. Default: all of the plant.
         jobs: Worker processes, -1 for one per core.
         output: Folder that gets PLANT.json. Default: `fits` in the package of the methods, whence they are read.
         renew: The plant's file has changed and its flights should not have: find some of the fits anew, and where they are
@@ -48,20 +50,20 @@ def fit(
     entries = [
         entry for entry in map(find_diagnoser, named(diagnosers)) if entry.takes("belief") or entry.takes("calibration")
     ]
-    suites = [suite for suite in map(load_suite, suite_names()) if suite.plant == plant_id]
-    if not entries or not suites:
-        raise ValueError(f"nothing to fit: {len(suites)} suites of {plant_id}, {len(entries)} methods that take a belief")
+    asked = [suite for suite in map(load_suite, suites or suite_names()) if suite.plant == plant_id]
+    if not entries or len(asked) < max(1, len(suites)):
+        raise ValueError(f"nothing to fit: {len(asked)} suites of {plant_id}, {len(entries)} methods that take a belief")
     if renew:
         for path in {(package_of(entry) or Path()) / "fits" / f"{plant_id}.json" for entry in entries}:
             seed = secrets.randbits(32) if seed is None else seed
-            knowledge.write_fits(path, knowledge.renewed(path, entries, suites, count, seed))
+            knowledge.write_fits(path, knowledge.renewed(path, entries, asked, count, seed))
             print(f"{count} beliefs and {count} calibrations (seed {seed}) are the same bytes; {path} is of this code now")
         return
     with on(backend, cluster):
-        fits = knowledge.fit_suites(entries, suites, jobs)
+        fits = knowledge.fit_suites(entries, asked, jobs)
     for path, found in fits.items():
         place = path if output is None else output / path.name
-        if diagnosers != ("all",):
+        if suites or diagnosers != ("all",):
             found = knowledge.merged(place, found)
         knowledge.write_fits(place, found)
         print(f"{len(found.beliefs)} beliefs and {len(found.calibrations)} calibrations in {place}")

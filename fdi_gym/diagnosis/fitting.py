@@ -73,11 +73,10 @@ def _model_error(plant: Plant, scenarios: list[FaultScenario], record: Record, v
 
 
 def _magnitudes(plant: Plant, z: Array, record: Record, block: int) -> tuple[Array, Array, Array]:
-    """Mean, standard deviation and walk of each mode's magnitude, over the samples where it acts (modes,)."""
-    count, m = len(plant.modes), plant.magnitudes(record.label, z)
+    """Mean, standard deviation and walk of each magnitude, over the samples where its mode acts (n_magnitudes,)."""
+    count, m = plant.n_magnitudes, plant.magnitudes(record.label, z)
     mean, std, walk = np.zeros(count), np.zeros(count), np.zeros(count)
-    for i, mode in enumerate(plant.modes):
-        low, high = mode.reach
+    for i, (low, high) in enumerate(plant.reaches.tolist()):
         values = np.clip(m[..., i][np.isfinite(m[..., i])], low, high)
         if values.size:
             mean[i], std[i] = values.mean(), values.std()
@@ -90,7 +89,7 @@ def _magnitudes(plant: Plant, z: Array, record: Record, block: int) -> tuple[Arr
 
 
 class _Sizes(NamedTuple):
-    """What is found of the faults: of the entries of the fault vector (p,), and of the modes (modes,)."""
+    """What is found of the faults: of the entries of the fault vector (p,), and of the magnitudes (n_magnitudes,)."""
 
     z_size: Array
     z_walk: Array
@@ -104,17 +103,17 @@ def _alike(plant: Plant, bare: Plant, z: Array, flown: Array, block: int, s: _Si
 
     z (N, K, estimated).
     """
-    own, modes = len(bare.estimated), len(bare.modes)
+    own, modes, magnitudes = len(bare.estimated), len(bare.modes), bare.n_magnitudes
     units = np.array([e.scale for e in plant.estimated[own:]])
     bias = z[..., own:] / units
     values = np.abs(bias[bias != 0.0])
     steps = np.sqrt(np.diag(long_run(np.diff(bias, axis=1), flown, block)).mean())
     walk = steps if steps > 0 else 0.02
-    of_mode = np.array([units[np.argmax(mode.direction[own:])] for mode in plant.modes[modes:]])
+    of_mode = np.array([units[np.argmax(line[own:])] for mode in plant.modes[modes:] for line in mode.directions])
     std = float(np.sqrt((values**2).mean())) if values.size else 1.0
     size = float(np.median(values)) if values.size else 1.0
     more = (size * units, walk * units, 0.0 * of_mode, std * of_mode, walk * of_mode)
-    firsts = (own, own, modes, modes, modes)
+    firsts = (own, own, magnitudes, magnitudes, magnitudes)
     return _Sizes(*(np.concatenate([a[:n], b]) for a, n, b in zip(s, firsts, more, strict=True)))
 
 

@@ -164,7 +164,7 @@ def augmented(
     """
     inputs = fault_inputs(plant)
     n_x, n_z, n_d = len(plant.states), len(belief.z_size), len(belief.disturbances)
-    if len(belief.x0) != n_x or n_z != len(inputs.names) or len(belief.m_mean) != len(plant.modes):
+    if len(belief.x0) != n_x or n_z != len(inputs.names) or len(belief.m_mean) != plant.n_magnitudes:
         raise ValueError(f"the belief is not one of {plant.id}: its states, faults or modes are others")
     for name, given, n in (("x0_std", x0_std, n_x), ("z0_std", z0_std, n_z), ("z_walk", z_walk, n_z)):
         if given is not None and len(given) != n:

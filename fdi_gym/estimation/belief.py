@@ -25,7 +25,8 @@ class Belief(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         sensors: Which those are (m,).
         z_size: Median size of a fault while it acts, per entry of the fault vector (p,).
         z_walk: Standard deviation of the random walk that follows it (p,).
-        m_mean, m_std, m_walk: Magnitude of each fault mode along its line while it acts: mean, spread, walk (modes,).
+        m_mean, m_std, m_walk: The magnitudes of the fault modes along their directions while they act: mean, spread, walk
+            (n_magnitudes,).
         changes: Changes of the label per sample.
         disturbances: The disturbances that occur and are not measured (q,).
         d0, d_walk: Their initial standard deviations and walks (q,).
@@ -48,8 +49,8 @@ class Belief(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def __post_init__(self) -> None:
         n, m, p, q = len(self.x0), len(self.sensors), len(self.z_size), len(self.disturbances)
-        modes = len(self.m_mean)
-        shapes = {"P0": (n, n), "Q": (n, n), "R": (m, m), "z_walk": (p,), "m_std": (modes,), "m_walk": (modes,),
+        magnitudes = len(self.m_mean)
+        shapes = {"P0": (n, n), "Q": (n, n), "R": (m, m), "z_walk": (p,), "m_std": (magnitudes,), "m_walk": (magnitudes,),
                   "d0": (q,), "d_walk": (q,)}  # fmt: skip
         for name, shape in shapes.items():
             if np.shape(getattr(self, name)) != shape:

@@ -11,11 +11,17 @@ from collections.abc import Mapping
 
 import msgspec
 import numpy as np
+from scipy.special import chdtri
 
-from fdi_gym.plant import Array, Plant
+from fdi_gym.plant import Array, FaultMode, Plant
 
-LEAST = 3.84  # a threshold is never below the 95 % point of one degree of freedom
+LEAST = 3.84  # the 95 % point of one degree of freedom
 RATE = 0.05  # share of the healthy flights with a false alarm
+
+
+def least(mode: FaultMode) -> float:
+    """What a threshold of a mode is never below: the 95 % point of as many degrees of freedom as it has magnitudes."""
+    return round(float(chdtri(len(mode.directions), 0.05)), 2)
 
 
 class Persistence(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -98,7 +104,7 @@ def thresholds_from(
     alone = {next(iter(label.modes)): i for i, label in enumerate(plant.labels) if len(label.modes) == 1}
     after = persistence.rise
     levels = {
-        m.name: _reached(cost[..., 0] - cost[..., alone[m.name]], after, LEAST) if m.name in alone else LEAST
+        m.name: _reached(cost[..., 0] - cost[..., alone[m.name]], after, least(m)) if m.name in alone else least(m)
         for m in plant.modes
     }
     share = _reached(gain(cost, Calibration(thresholds=levels).penalties(plant)), after, 0.5)

@@ -10,7 +10,7 @@ from fdi_gym.estimation.automaton import Automaton
 from fdi_gym.estimation.belief import FaultInputs, noisy_sensors
 from fdi_gym.estimation.calibration import Persistence
 from fdi_gym.estimation.decision import Evidence, Reading, Rule, Verdict, declare, undeclared
-from fdi_gym.estimation.labels import channel_sets, label_of_channels
+from fdi_gym.estimation.labels import flags_of, label_of_channels
 from fdi_gym.plant import Array, Plant
 
 CHANNELS = Persistence(3, 1, 20)
@@ -47,7 +47,7 @@ def by_channels(plant: Plant, inputs: FaultInputs, alpha: float, thresholds: Arr
     J = np.asarray(thresholds, float)
     if J.shape != (len(inputs.names),):
         raise ValueError(f"one threshold per channel ({', '.join(inputs.names)}) is needed, not {np.asarray(J).tolist()}")
-    labels, sets = channel_sets(plant, inputs)
+    labels, sets = flags_of(plant, inputs)
     every = len(noisy_sensors(plant))
 
     def start(n: int) -> Smoothed:

@@ -1,11 +1,12 @@
 """The labels as sets: what each looks like in the space of the estimate, and which channels it moves.
 
-A label of f simultaneous faults spans offset + directions m, low <= m <= high, in the estimated space; how well it fits an
-estimate is its distance in the metric of the estimate's covariance.
+A label whose faults have f magnitudes spans offset + directions m, low <= m <= high, in the estimated space, a line, a plane
+or more; how well it fits an estimate is its distance in the metric of the estimate's covariance.
 """
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -19,11 +20,11 @@ from fdi_gym.plant import Array, Plant
 class Manifolds(NamedTuple):
     """The sets that the faulty labels span in the estimated space: offset + direction m, low <= m <= high.
 
-    They have up to f simultaneous faults; what is beyond a label's own number is 0.
+    They have up to f magnitudes; what is beyond a label's own number is 0.
     """
 
     labels: Array  # (h,) label indices
-    faults: Array  # (h,) simultaneous faults of each
+    magnitudes: Array  # (h,) how many each has: one a fault, more for a fault that is a plane
     offset: Array  # (h, p)
     direction: Array  # (h, p, f)
     low: Array  # (h, f)
@@ -38,16 +39,24 @@ def manifolds(plant: Plant) -> Manifolds:
     """The faulty labels of a plant as sets, from the lines of their modes, those with fewer faults first."""
     modes = {mode.name: mode for mode in plant.modes}
     faulty = sorted((i for i, label in enumerate(plant.labels) if label.modes), key=lambda i: len(plant.labels[i].modes))
-    faults = np.array([len(plant.labels[i].modes) for i in faulty], np.int64)
-    h, p, f = len(faulty), len(plant.estimated), int(faults.max(initial=0))
+    magnitudes = magnitudes_of_labels(plant)[faulty]
+    h, p, f = len(faulty), len(plant.estimated), int(magnitudes.max(initial=0))
     offset, direction, low, high = np.zeros((h, p)), np.zeros((h, p, f)), np.zeros((h, f)), np.zeros((h, f))
     for row, index in enumerate(faulty):
-        for column, name in enumerate(sorted(plant.labels[index].modes)):
-            line = modes[name]
-            offset[row] += line.offset
-            direction[row, :, column] = line.direction
-            low[row, column], high[row, column] = line.reach
-    return Manifolds(np.array(faulty, np.int64), faults, offset, direction, low, high)
+        column = 0
+        for name in sorted(plant.labels[index].modes):
+            mode = modes[name]
+            mine = slice(column, column := column + len(mode.directions))
+            offset[row] += mode.offset
+            direction[row, :, mine] = mode.directions.T
+            low[row, mine], high[row, mine] = mode.reaches.T
+    return Manifolds(np.array(faulty, np.int64), magnitudes, offset, direction, low, high)
+
+
+def magnitudes_of_labels(plant: Plant) -> Array:
+    """How many magnitudes the faults of each label have together (labels,)."""
+    count = {mode.name: len(mode.directions) for mode in plant.modes}
+    return np.array([sum(count[name] for name in label.modes) for label in plant.labels], np.int64)
 
 
 def nearest_of(I: Array, Iz: Array, sets: Manifolds) -> tuple[Array, Array]:  # noqa: E741
@@ -91,17 +100,42 @@ def distances(z: Array, P: Array, sets: Manifolds, excess: Array | None = None) 
 def channel_sets(plant: Plant, inputs: FaultInputs) -> tuple[Array, Array]:
     """The labels that these channels can express, and their channels: (labels,) indices, (labels, p) bool.
 
-    A fault mode's channel is the entry of the estimated space along which it lies.
+    A fault mode's channel is the entry of the estimated space along which it lies; of a plane there is one a direction.
     """
-    channel = {mode.name: int(np.argmax(np.abs(mode.direction))) for mode in plant.modes}
-    order = [int(i) for i in inputs.estimated]
+    channels = {mode.name: np.argmax(np.abs(mode.directions), axis=1).tolist() for mode in plant.modes}
+    order, count = [int(i) for i in inputs.estimated], magnitudes_of_labels(plant)
     found, sets = [], []
     for index, label in enumerate(plant.labels):
-        members = {channel[name] for name in label.modes}
-        if len(members) == len(label.modes) and members <= set(order):
+        members = {channel for name in label.modes for channel in channels[name]}
+        if len(members) == count[index] and members <= set(order):
             found.append(index)
             sets.append([i in members for i in order])
     return np.array(found), np.array(sets)
+
+
+def flags_of(plant: Plant, inputs: FaultInputs) -> tuple[Array, Array]:
+    """Which flags on these channels say which label: (rows,) labels, (rows, p) bool, as `label_of_channels` takes them.
+
+    As `channel_sets`; of a plane a flag on any of its channels says it, so a label with planes has several rows.
+    """
+    labels, sets = channel_sets(plant, inputs)
+    planes = {m.name: m.moves[inputs.estimated] for m in plant.modes if len(m.directions) > 1}
+    found, rows = [labels], [sets]
+    for index, row in zip(labels, sets, strict=True):
+        parts = [planes[name] for name in plant.labels[index].modes if name in planes]
+        for left in itertools.product(*(_proper_parts(part) for part in parts)):
+            less = row & ~np.any(left, axis=0)
+            if (less != row).any():
+                found.append(np.array([index]))
+                rows.append(less[None])
+    return np.concatenate(found), np.concatenate(rows)
+
+
+def _proper_parts(mask: Array) -> list[Array]:
+    """All masks of a part of True entries that is not the whole."""
+    where = np.flatnonzero(mask)
+    chosen = itertools.chain.from_iterable(itertools.combinations(where, n) for n in range(len(where)))
+    return [np.isin(np.arange(len(mask)), part) for part in chosen]
 
 
 def label_of_channels(labels: Array, sets: Array, on: Array, severity: Array) -> Array:
@@ -115,6 +149,7 @@ def label_of_channels(labels: Array, sets: Array, on: Array, severity: Array) ->
 
 
 def tells_apart(plant: Plant, inputs: FaultInputs) -> bool:
-    """Whether flags on these channels can say which fault it is: each mode moves one of them at most, no two the same."""
-    moved = np.array([np.add(np.abs(mode.offset), np.abs(mode.direction)) > 0 for mode in plant.modes])[:, inputs.estimated]
-    return bool((moved.sum(axis=1) <= 1).all() and (moved.sum(axis=0) <= 1).all())
+    """Whether flags on these channels can say which fault it is: each magnitude moves one of them, no two modes the same."""
+    moved = np.array([mode.moves for mode in plant.modes])[:, inputs.estimated]
+    count = np.array([len(mode.directions) for mode in plant.modes])
+    return bool((moved.sum(axis=1) <= count).all() and (moved.sum(axis=0) <= 1).all())

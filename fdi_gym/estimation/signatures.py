@@ -26,9 +26,9 @@ def secants(plant: Plant, size: Array) -> tuple[Array, Array]:
     """
     up, down = np.zeros(len(size), bool), np.zeros(len(size), bool)
     for mode in plant.modes:
-        ends = np.array(mode.offset)[:, None] + np.outer(mode.direction, mode.reach)
-        up |= (ends > 0).any(axis=1)
-        down |= (ends < 0).any(axis=1)
+        ends = mode.directions[:, :, None] * mode.reaches[:, None]  # (f, p, 2)
+        up |= mode.offset + ends.max(axis=2).sum(axis=0) > 0
+        down |= mode.offset + ends.min(axis=2).sum(axis=0) < 0
     return np.where(down | ~up, -size, 0.0), np.where(up | ~down, size, 0.0)
 
 

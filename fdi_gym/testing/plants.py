@@ -113,7 +113,7 @@ def _check_record(plant: Plant, name: str, scenarios: Sequence[FaultScenario], r
 
 
 def _check_lines(plant: Plant, name: str, faults: Sequence[Fault], deviation: Array, start: int) -> None:
-    """deviation (K, n) from healthy, in scales, is the sum of a point of each active mode's line, within its reach.
+    """deviation (K, n) from healthy, in scales, is the sum of a point of each active mode's line or plane, within its reach.
 
     A fault that is building up may be anywhere between healthy and there, an intermittent one at either.
     """
@@ -122,10 +122,11 @@ def _check_lines(plant: Plant, name: str, faults: Sequence[Fault], deviation: Ar
     building = {f.mode for f in faults for e in f.effects if isinstance(e, Incipient)}
     blinking = {f.mode for f in faults for e in f.effects if isinstance(e, Intermittent)}
     moving = [mode for mode in modes if any(mode.offset) and mode.name in building | blinking]
-    lines = np.array([mode.direction for mode in modes] + [mode.offset for mode in moving]).reshape(-1, scale.size) / scale
+    directions = [(mode, *row) for mode in modes for row in zip(mode.directions, mode.reaches.tolist(), strict=True)]
+    lines = np.array([d for _, d, _ in directions] + [mode.offset for mode in moving]).reshape(-1, scale.size) / scale
     fixed = np.sum([np.array(m.offset) / scale for m in modes if m not in moving], axis=0) if modes else np.zeros(scale.size)
     rest = deviation - fixed
-    at = np.linalg.lstsq(lines.T, rest.T, rcond=None)[0].T  # (K, lines): m of each mode, then the share of moving offsets
+    at = np.linalg.lstsq(lines.T, rest.T, rcond=None)[0].T  # (K, lines): the magnitudes, then the share of moving offsets
     off = np.abs(rest - at @ lines)
     k, j = np.unravel_index(off.argmax(), off.shape)
     who = " + ".join(mode.name for mode in modes) or "no mode"
@@ -135,18 +136,18 @@ def _check_lines(plant: Plant, name: str, faults: Sequence[Fault], deviation: Ar
     )
     if np.linalg.matrix_rank(lines) < len(lines):
         return  # the lines share a direction: the parts can't be told apart
-    for i, mode in enumerate(modes):
-        m, share = at[:, i], at[:, len(modes) + moving.index(mode)] if mode in moving else np.ones(len(at))
-        low, high = (np.multiply.outer(share, mode.reach)).T
+    for i, (mode, _, reach) in enumerate(directions):
+        m, share = at[:, i], at[:, len(directions) + moving.index(mode)] if mode in moving else np.ones(len(at))
+        low, high = (np.multiply.outer(share, reach)).T
         if not any(mode.offset) and (mode.name in building or name != "standard"):
             low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
         if not any(mode.offset) and mode.name in blinking:
-            m = np.where(np.abs(m) < 1e-12, mode.reach[0], m)
+            m = np.where(np.abs(m) < 1e-12, reach[0], m)
         slack = 1e-9 * (1 + np.abs(m))
         outside = (m < low - slack) | (m > high + slack) | (share < -1e-9) | (share > 1 + 1e-9)
         k = int(outside.argmax())
         assert not outside[k], (
-            f"{name}: at sample {start + 1 + k}, {mode.name} is at {m[k]:.4g} on its line, whose reach is {mode.reach}"
+            f"{name}: at sample {start + 1 + k}, {mode.name} is at {m[k]:.4g} on its line, whose reach is {tuple(reach)}"
         )
 
 
