@@ -125,7 +125,7 @@ def test_nothing_ever_reported_raises_nothing(name):
     obs = simulate(plant, [draw(plant.process("standard"), FIRST)]).obs[:, :300].copy()
     obs[..., : len(plant.outputs)] = np.nan
     said = run(diagnoser, obs)
-    if name != "random":
+    if name not in ("random", "false_alarm"):  # which look at nothing
         assert not said.alarm.any()
     assert not np.isinf(said.estimate if said.estimate is not None else 0.0).any()
 
