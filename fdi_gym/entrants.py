@@ -50,6 +50,7 @@ def _is_prober(suite: AnySuite, plant: Plant, name: str) -> bool:
     build = find_function("prober or diagnoser" if probing else "diagnoser", check_diagnoser_name(name))
     if build not in _probes:
         _probes[build] = any(entry.build is build for entry in probers().values())
+    if probing and not _probes[build]:
         try:
             entry = find_prober(name)
             if plant.acting is not None and not {"belief", "calibration", "scenarios"} & set(entry.parameters):

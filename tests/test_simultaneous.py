@@ -113,7 +113,7 @@ def test_a_sum_of_lines_is_taken_apart():
     A = rng.standard_normal((4, 4))
     information = 100 * (A @ A.T + np.eye(4))
     for i, j in ((0, 2), (0, 3), (1, 2), (1, 3)):
-        z = sum(lines.offset[m] + lines.direction[m] * v for m, v in ((i, -0.5), (j, -0.6)))
+        z = sum(lines.offset[m] + lines.directions[m, 0] * v for m, v in ((i, -0.5), (j, -0.6)))
         gained, _ = lines.pursue(z[None], information[None], threshold)
         assert set(np.flatnonzero(gained[0])) == {i, j}
     assert not lines.pursue(np.zeros((1, 4)), information[None], threshold)[0].any()

@@ -13,7 +13,7 @@ from fdi_gym.commands.arguments import Backend, Cluster, Names
 def fit(
     plant: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PLANT")],
     diagnosers: Names = ("all",),
-    suites: tuple[str, ...] = (),
+    suites: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SUITE")] = (),
     jobs: int = -1,
     output: Path | None = None,
     renew: bool = False,
