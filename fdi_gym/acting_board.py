@@ -236,9 +236,11 @@ def verdict(acted: Acted) -> str:
     late = {n: mean_interval((mine - delays(acted.outcomes[n], far, acted.plant.dt))[np.isfinite(mine)]) for n in others}
     sure = all(drawn.difference(name, n)[1] > 0 for n in others) and all(gap[2] < 0 for gap in late.values())
     added = mean_interval(acted.cost(name) - acted.cost(passive.diagnoser))
+    gap = late[passive.diagnoser]
+    when = f"{said(gap, 2)} s later" if gap[0] > 0 else f"{said((-gap[0], -gap[2], -gap[1]), 2)} s sooner"
     return (
         f"The best chosen probing, `{name}`, has {said(gain, 1, 100.0)} points of accuracy per sample more than the best "
-        f"that never probes, and isolates {said(late[passive.diagnoser], 2)} s later, at a cost of {said(added)}: it "
+        f"that never probes, and isolates {when}, at a cost of {said(added)}: it "
         f"{'beats every entrant that never probes' if sure else 'does not beat every entrant that never probes'} in both."
     )
 
