@@ -17,7 +17,7 @@ from fdi_gym.diagnosis import Decisions, Diagnoser, Entry, diagnosers, find_diag
 from fdi_gym.engine import Record
 from fdi_gym.metrics import Acted
 from fdi_gym.names import blame, blamed, check_diagnoser_name, find_function, unknown
-from fdi_gym.plant import Plant
+from fdi_gym.plant import NotApplicableError, Plant
 from fdi_gym.suite import ActingSuite, AnySuite
 
 NOTHING = "null"  # the diagnoser for which nothing is ever reconfigured
@@ -34,30 +34,41 @@ def find_entrant(suite: AnySuite, plant: Plant, name: str) -> Entry:
     probing = isinstance(suite, ActingSuite) and suite.acts == "probing"
     if isinstance(suite, ActingSuite) and not probing and name == TRUTH.name:
         return TRUTH
-    if name in probers() or (":" in name and _is_prober(suite, plant, name)):
+    if name in probers() or (":" in name and _is_prober(suite, plant, name, probing)):
         if not probing:
-            what = "allows for diagnoses" if isinstance(suite, ActingSuite) else "is of flights that nobody acts on"
-            raise ValueError(f"{name} is a prober, and {suite.name} {what}: a diagnoser enters there")
+            raise _misplaced(suite, name)
         return find_prober(name)
     if probing and ":" not in name and name not in diagnosers():
         raise unknown("prober or diagnoser", name, [*probers(), *diagnosers()])
     return find_diagnoser(name)
 
 
-def _is_prober(suite: AnySuite, plant: Plant, name: str) -> bool:
-    """Whether a builder outside the package makes a prober: one that takes nothing that only diagnosers get is asked."""
-    probing = isinstance(suite, ActingSuite) and suite.acts == "probing"
+def _misplaced(suite: AnySuite, name: str) -> ValueError:
+    what = "allows for diagnoses" if isinstance(suite, ActingSuite) else "is of flights that nobody acts on"
+    return ValueError(f"{name} is a prober, and {suite.name} {what}: a diagnoser enters there")
+
+
+def _is_prober(suite: AnySuite, plant: Plant, name: str, probing: bool) -> bool:
+    """Whether a builder outside the package makes a prober: it is registered as one, or is asked where probers enter.
+
+    One that takes what only diagnosers get is not asked.
+    """
     build = find_function("prober or diagnoser" if probing else "diagnoser", check_diagnoser_name(name))
+    if any(entry.build is build for entry in probers().values()):
+        return True
+    return probing and _makes_prober(suite, plant, name, build)
+
+
+def _makes_prober(suite: AnySuite, plant: Plant, name: str, build: Callable[..., Any]) -> bool:
     if build not in _probes:
-        _probes[build] = any(entry.build is build for entry in probers().values())
-    if probing and not _probes[build]:
+        _probes[build] = False
         try:
             entry = find_prober(name)
             if plant.acting is not None and not {"belief", "calibration", "scenarios"} & set(entry.parameters):
                 period = suite.decision_period if isinstance(suite, ActingSuite) else 1
                 _probes[build] = isinstance(entry.build(plant, **_told(entry, suite.process, period)), Prober)
         except Exception:  # whatever it is, it is built, and blamed, as what it is asked for
-            return _probes[build]
+            return False
     return _probes[build]
 
 
@@ -118,7 +129,16 @@ def make_entrant(suite: AnySuite, plant: Plant, name: str, scenarios: Sequence[A
             prober = make_prober(name, plant, process=suite.process, period=suite.decision_period, **settings)
         return make_diagnoser(suite.on_board, plant, **told, **suite.settings.get(suite.on_board, {})), prober
     with blamed(name):
-        return entry.build(plant) if entry is TRUTH else make_diagnoser(name, plant, **told, **settings), NEVER
+        try:
+            return entry.build(plant) if entry is TRUTH else make_diagnoser(name, plant, **told, **settings), NEVER
+        except NotApplicableError:
+            raise
+        except (
+            ValueError
+        ):  # it may be what enters elsewhere: where probers do not enter nobody was asked before it was built
+            if ":" in name and _makes_prober(suite, plant, name, entry.build):
+                raise _misplaced(suite, name) from None
+            raise
 
 
 class Flown(NamedTuple):

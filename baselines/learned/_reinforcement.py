@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -27,7 +27,7 @@ from baselines.learned.feature_env import IdentifiedFeatures
 from baselines.learned.features import FeatureModel
 from baselines.learned.flights import VALIDATION
 from baselines.learned.policy import policy_diagnoser
-from baselines.learned.recipes import PolicyRecipe
+from baselines.learned.recipes import LegsRecipe, PolicyRecipe
 from fdi_gym.diagnosis import run
 from fdi_gym.engine import Record
 from fdi_gym.plant import Array
@@ -47,10 +47,15 @@ def actor_tensors(state: Mapping[str, Any]) -> dict[str, Array]:
     }
 
 
-class PolicyTraining(Training[PolicyRecipe]):
-    """A run of legs; arguments as in `Training`."""
+L = TypeVar("L", bound=LegsRecipe)
+
+
+class Legs(Training[L]):
+    """PPO in legs, each with flights of its own; arguments as in `Training`."""
 
     unit, score = "leg", "reward"
+    agent: Any  # PPO
+    venvs: list[FDIVecEnv]  # one a condition; the legs take them in turn
 
     def plan(self) -> None:
         """Legs, each with flights under one condition."""
@@ -58,6 +63,29 @@ class PolicyTraining(Training[PolicyRecipe]):
         self.per_leg = r.envs * r.steps * r.updates  # decisions
         self.rounds = max(1, round(r.decisions / self.per_leg))
         self.together, self.flights = r.envs, self.rounds * r.envs
+
+    def learned(self) -> tuple[torch.nn.Module, torch.optim.Optimizer]:
+        """Actor and critic."""
+        return self.agent.policy, self.agent.policy.optimizer
+
+    def place(self) -> dict[str, int]:
+        """Decisions."""
+        return {"step": self.done * self.per_leg}
+
+    def learn(self) -> float:
+        """Fly and learn; the mean reward per decision."""
+        r, agent, index = self.recipe, self.agent, self.done % len(self.venvs)
+        agent.set_random_seed(int(np.random.SeedSequence([self.seed, self.done]).generate_state(1)[0]))
+        self.venvs[index]._seeds = list(self.seeds_of(self.done, index))
+        agent.set_env(self.venvs[index])  # the leg begins with a reset
+        agent.learning_rate = r.rate * (1 - 0.9 * self.done / self.rounds)
+        agent._setup_lr_schedule()
+        agent.learn(self.per_leg, reset_num_timesteps=False)
+        return float(agent.rollout_buffer.rewards.mean())
+
+
+class PolicyTraining(Legs[PolicyRecipe]):
+    """A policy on the features of `IdentifiedFeatures`."""
 
     def begin(self) -> None:
         """Identify the plant, and make a new policy."""
@@ -96,10 +124,6 @@ class PolicyTraining(Training[PolicyRecipe]):
             envs = DelayAwareReward(envs, r.patience, np.minimum(weight, HEAVIEST).tolist())
         return FDIVecEnv(IdentifiedFeatures(envs, plant, r.shape, self.model))
 
-    def learned(self) -> tuple[torch.nn.Module, torch.optim.Optimizer]:
-        """Actor and critic."""
-        return self.agent.policy, self.agent.policy.optimizer
-
     def state(self) -> dict[str, Array]:
         """The identified model, and the shares of the labels."""
         return {**weights.model_tensors(self.model), "share": self.share}
@@ -107,21 +131,6 @@ class PolicyTraining(Training[PolicyRecipe]):
     def restore(self, tensors: Mapping[str, Array]) -> None:
         """As `begin` has left it."""
         self.make(weights.model_of(tensors), tensors["share"])
-
-    def place(self) -> dict[str, int]:
-        """Decisions."""
-        return {"step": self.done * self.per_leg}
-
-    def learn(self) -> float:
-        """Fly and learn; the mean reward per decision."""
-        r, agent, index = self.recipe, self.agent, self.done % len(self.venvs)
-        agent.set_random_seed(int(np.random.SeedSequence([self.seed, self.done]).generate_state(1)[0]))
-        self.venvs[index]._seeds = list(self.seeds_of(self.done, index))
-        agent.set_env(self.venvs[index])  # the leg begins with a reset
-        agent.learning_rate = r.rate * (1 - 0.9 * self.done / self.rounds)
-        agent._setup_lr_schedule()
-        agent.learn(self.per_leg, reset_num_timesteps=False)
-        return float(agent.rollout_buffer.rewards.mean())
 
     @functools.cached_property
     def validation(self) -> list[Record]:

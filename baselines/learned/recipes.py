@@ -58,12 +58,10 @@ class SequenceRecipe(Recipe):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PolicyRecipe(Recipe):
-    """How a policy is trained by PPO; the conditions take turns.
+class LegsRecipe(Recipe):
+    """How a policy is trained by PPO, in legs that begin new flights.
 
     Args:
-        task: "isolation" or "identification".
-        patience: Of the delay-aware reward, in decisions.
         decisions: The budget.
         envs: Environments side by side. Their flights begin together, so `steps` should span whole flights ...
         steps: Decisions of each per update; ... but not their very end, where new flights would begin for nothing.
@@ -73,17 +71,32 @@ class PolicyRecipe(Recipe):
         entropy: Weight of the entropy.
     """
 
-    hidden: int = 128
     rate: float = 1e-3
     validation: int = 60
+    decisions: int
+    envs: int = 64
+    steps: int
+    updates: int = 1
+    epochs: int
+    batch: int = 512
+    entropy: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyRecipe(LegsRecipe):
+    """How a policy learns to diagnose; the conditions take turns.
+
+    Args:
+        task: "isolation" or "identification".
+        patience: Of the delay-aware reward, in decisions.
+    """
+
+    hidden: int = 128
     task: str = "isolation"
     patience: float = 10.0
     decisions: int = 1_000_000
-    envs: int = 64
     steps: int = 250
-    updates: int = 1
     epochs: int = 4
-    batch: int = 512
     entropy: float = 0.01
 
 

@@ -54,7 +54,6 @@ def courses(plant: Plant, scenarios: Sequence[FaultScenario]) -> Array:
     "Extended Kalman filters, one per hypothesis, told when faults act and their course; for the three tanks",
     knows="when each fault acts and the course of its size",
     ceiling=True,
-    sensors=True,
 )
 def known_course_oracle(plant: Plant, belief: Belief, *, scenarios: Sequence[FaultScenario]) -> Diagnoser:
     """The oracle.

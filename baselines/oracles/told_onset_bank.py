@@ -167,8 +167,9 @@ def told_bank(
         P[changed, :, :, z] = 0.0
         P[..., z, z] = np.where(changed[:, None, None, None], r.M0, P[..., z, z])
         X1, P1 = sized(share).predict("extended", X.reshape(-1, N), P.reshape(-1, N, N), at)
-        s = s._replace(share=share, among=s.allowed[each, np.minimum(k, s.allowed.shape[1] - 1)])
-        return s._replace(X=X1.reshape(n, count, N), P=P1.reshape(n, count, N, N), log=log, now=now)
+        among = s.allowed[each, np.minimum(k, s.allowed.shape[1] - 1)]
+        X1, P1 = X1.reshape(n, count, N), P1.reshape(n, count, N, N)
+        return s._replace(X=X1, P=P1, log=log, now=now, share=share, among=among)
 
     def update(s: Bank, at: Interval, y: Array, seen: Array) -> Bank:
         n = len(s.now)

@@ -34,6 +34,15 @@ class Told(NamedTuple):
     now: Array  # (n,) bool: a fault acts
 
 
+def true_labels(plant: Plant, scenarios: Sequence[FaultScenario]) -> Array:
+    """The label of each flight's samples (n, K + 1); the last one goes on where others fly longer."""
+    label = np.zeros((len(scenarios), 1 + max((scenario.steps for scenario in scenarios), default=0)), np.int64)
+    for row, scenario in zip(label, scenarios, strict=True):
+        rows = plant.label_rows(scenario)
+        row[: len(rows)], row[len(rows) :] = rows, rows[-1]
+    return label
+
+
 def label_changes(plant: Plant, scenarios: Sequence[FaultScenario], n: int) -> tuple[Array, Array]:
     """Where the label of n flights changes, and where a fault acts: (n, K + 1) bool each.
 
@@ -42,10 +51,7 @@ def label_changes(plant: Plant, scenarios: Sequence[FaultScenario], n: int) -> t
     """
     if n != len(scenarios):
         raise ValueError(f"the oracle was told of {len(scenarios)} flights, not {n}")
-    label = np.zeros((n, 1 + max((scenario.steps for scenario in scenarios), default=0)), np.int64)
-    for row, scenario in zip(label, scenarios, strict=True):
-        rows = plant.label_rows(scenario)
-        row[: len(rows)], row[len(rows) :] = rows, rows[-1]
+    label = true_labels(plant, scenarios)
     return np.column_stack([np.zeros(n, bool), np.diff(label, axis=1) != 0]), label > 0
 
 

@@ -18,6 +18,7 @@ from baselines.oracles.innovation_oracle import innovation_oracle
 from baselines.oracles.known_onset_oracle import known_onset_oracle
 from baselines.oracles.matched_oracle import matched_oracle
 from baselines.oracles.told_onset_bank import rows, told_bank
+from baselines.oracles.told_onset_ekf import true_labels
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
 from fdi_gym.diagnosis.contract import widened
 from fdi_gym.estimation.belief import Belief
@@ -84,10 +85,7 @@ def told_source_oracle(plant: Plant, belief: Belief, *, scenarios: Sequence[Faul
     if plant.bare is None:
         raise NotApplicableError(f"no label of {plant.id} is a sensor's fault; with the option sensor_faults there are")
     labels, of_plant = len(plant.labels), len(plant.bare.labels)
-    label = np.zeros((len(scenarios), 1 + max(s.steps for s in scenarios)), np.int64)
-    for row, scenario in zip(label, scenarios, strict=True):
-        true = plant.label_rows(scenario)
-        row[: len(true)], row[len(true) :] = true, true[-1]
+    label = true_labels(plant, scenarios)
     allowed = (label >= of_plant)[..., None] == (np.arange(labels) >= of_plant)
     hypotheses = told_bank(plant, rows(plant, even(plant, belief)), scenarios, allowed=allowed)
     ceiling = own_ceiling(plant.bare, scenarios)

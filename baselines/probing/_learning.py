@@ -13,7 +13,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 from gymnasium.spaces import Box, Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
@@ -22,8 +21,7 @@ from stable_baselines3.common.logger import Logger
 
 import fdi_gym  # noqa: F401 (registers the environments)
 from baselines.learned import flights as data
-from baselines.learned._reinforcement import actor_tensors
-from baselines.learned._training import Training
+from baselines.learned._reinforcement import Legs, actor_tensors
 from baselines.learned.flights import VALIDATION
 from baselines.probing.recipes import ProbingRecipe
 from baselines.probing.sight import Sight
@@ -110,17 +108,8 @@ def algorithm(recurrent: bool) -> type[Any]:
     return PPO
 
 
-class ProbingTraining(Training[ProbingRecipe]):
-    """A run of legs; arguments as in `Training`."""
-
-    unit, score = "leg", "reward"
-
-    def plan(self) -> None:
-        """Legs, each with new flights."""
-        r = self.recipe
-        self.per_leg = r.envs * r.steps * r.updates  # decisions
-        self.rounds = max(1, round(r.decisions / self.per_leg))
-        self.together, self.flights = r.envs, self.rounds * r.envs
+class ProbingTraining(Legs[ProbingRecipe]):
+    """A policy that probes."""
 
     def begin(self) -> None:
         """Environments and a new policy."""
@@ -130,20 +119,16 @@ class ProbingTraining(Training[ProbingRecipe]):
             cost_weight=0.0, autoreset_mode=AutoresetMode.SAME_STEP, truth=False, **self.plant.options,
         )  # fmt: skip
         self.on_board = make_diagnoser(r.on_board, self.plant, process=process)
-        sight = Sight(self.plant, process, r.period)
-        self.venv = FDIVecEnv(Probing(envs, self.on_board, sight, r.cost_weight))
+        self.sight = Sight(self.plant, process, r.period)
+        self.venvs = [FDIVecEnv(Probing(envs, self.on_board, self.sight, r.cost_weight))]
         shape: dict[str, Any] = {"net_arch": [r.hidden, r.hidden]}
         shape |= {"lstm_hidden_size": r.hidden} if r.recurrent else {}
         self.agent = algorithm(r.recurrent)(
-            "MlpLstmPolicy" if r.recurrent else "MlpPolicy", self.venv, learning_rate=r.rate, n_steps=r.steps,
+            "MlpLstmPolicy" if r.recurrent else "MlpPolicy", self.venvs[0], learning_rate=r.rate, n_steps=r.steps,
             batch_size=r.batch, n_epochs=r.epochs, gamma=r.discount, gae_lambda=0.95 if r.discount else 0.0,
             ent_coef=r.entropy, seed=self.seed, device="cpu", policy_kwargs=shape,
         )  # fmt: skip
         self.agent.set_logger(Logger(folder=None, output_formats=[]))
-
-    def learned(self) -> tuple[torch.nn.Module, torch.optim.Optimizer]:
-        """Actor and critic."""
-        return self.agent.policy, self.agent.policy.optimizer
 
     def state(self) -> dict[str, Array]:
         """Nothing else."""
@@ -152,21 +137,6 @@ class ProbingTraining(Training[ProbingRecipe]):
     def restore(self, tensors: Mapping[str, Array]) -> None:
         """As `begin` has left it."""
         self.begin()
-
-    def place(self) -> dict[str, int]:
-        """Decisions."""
-        return {"step": self.done * self.per_leg}
-
-    def learn(self) -> float:
-        """Fly and learn; the mean reward per decision."""
-        r, agent = self.recipe, self.agent
-        agent.set_random_seed(int(np.random.SeedSequence([self.seed, self.done]).generate_state(1)[0]))
-        self.venv._seeds = list(self.seeds_of(self.done, 0))
-        agent.set_env(self.venv)  # the leg begins with a reset
-        agent.learning_rate = r.rate * (1 - 0.9 * self.done / self.rounds)
-        agent._setup_lr_schedule()
-        agent.learn(self.per_leg, reset_num_timesteps=False)
-        return float(agent.rollout_buffer.rewards.mean())
 
     def validate(self) -> dict[str, float]:
         """Balanced accuracy per sample, the flight's cost per sample, and the reward that both come to."""
@@ -183,7 +153,7 @@ class ProbingTraining(Training[ProbingRecipe]):
         """The policy as it is now."""
         from baselines.probing.ppo import policy
 
-        return policy(self.venv.envs.sight, {k: v.astype(float) for k, v in self.tensors().items()}, self.recipe.hidden)  # type: ignore[attr-defined]
+        return policy(self.sight, {k: v.astype(float) for k, v in self.tensors().items()}, self.recipe.hidden)
 
     def tensors(self) -> dict[str, Array]:
         """The actor."""
