@@ -9,7 +9,8 @@ from conftest import PLANTS, build
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-from fdi_gym.diagnosis import NotApplicableError, diagnosers, make_diagnoser
+from fdi_gym.diagnosis import NotApplicableError, diagnosers, make_diagnoser, run
+from fdi_gym.engine import simulate
 from fdi_gym.envs import FDIEnv
 from fdi_gym.faults import draw
 from fdi_gym.testing import check_diagnoser, check_plant, check_streams, check_vector_env
@@ -74,3 +75,18 @@ def test_diagnoser(plant_id, name):
     except NotApplicableError as reason:
         pytest.skip(str(reason))
     check_diagnoser(make, build(plant_id), samples=150)
+
+
+@pytest.mark.parametrize("plant_id", PLANTS)
+@pytest.mark.parametrize("name", [name for name, entry in diagnosers().items() if entry.clairvoyant])
+def test_an_oracle_is_told_of_faults_beyond_the_end_of_the_flight(plant_id, name):
+    """They change nothing: a flight that is cut is diagnosed as the same flight without them."""
+    plant, samples = build(plant_id), 12
+    cut = [s.replace(steps=samples) for s in (draw(plant.process("standard"), seed) for seed in range(40)) if s.faults][:3]
+    assert all(fault.onset > samples for s in cut for fault in s.faults)
+    obs = simulate(plant, cut).obs
+    try:
+        said = [run(make_diagnoser(name, plant, scenarios=told), obs).label for told in (cut, [s.without_faults() for s in cut])]
+    except NotApplicableError as reason:
+        pytest.skip(str(reason))
+    assert np.array_equal(*said)

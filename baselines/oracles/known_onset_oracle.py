@@ -66,7 +66,7 @@ def known_onset_oracle(
     for i, scenario in enumerate(scenarios):
         for fault in scenario.faults:
             active[i, fault.onset : fault.end] = True
-            begins[i, fault.onset] = True
+            begins[i, fault.onset : fault.onset + 1] = True  # nothing where it lies beyond the flight
 
     def start(n: int) -> Windowed:
         if n != len(scenarios):
