@@ -86,7 +86,9 @@ def test_an_oracle_is_told_of_faults_beyond_the_end_of_the_flight(plant_id, name
     assert all(fault.onset > samples for s in cut for fault in s.faults)
     obs = simulate(plant, cut).obs
     try:
-        said = [run(make_diagnoser(name, plant, scenarios=told), obs).label for told in (cut, [s.without_faults() for s in cut])]
+        said = [
+            run(make_diagnoser(name, plant, scenarios=told), obs).label for told in (cut, [s.without_faults() for s in cut])
+        ]
     except NotApplicableError as reason:
         pytest.skip(str(reason))
     assert np.array_equal(*said)

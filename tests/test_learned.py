@@ -241,6 +241,23 @@ def test_a_folder_belongs_to_one_run(tiny):
         trained(tiny.parent, dataclasses.replace(TINY, rate=1.0))
 
 
+def test_weights_of_failing_sensors_are_others_and_name_them(tmp_path, b747):
+    plant = build("B747Lateral", sensor_faults=True)
+    path = train("pca", plant, budget=16, work=tmp_path)
+    card = weights.read_card(path)
+    assert path.stem == "pca-B747Lateral-sensors" != weights.stem("pca", b747)
+    assert card.processes == ["mixed"]
+    assert card.labels == [label.name for label in plant.labels]
+    assert card.command == "fdi-gym train pca B747Lateral --options sensor_faults true --budget 16"
+    assert make_diagnoser("pca", plant, process="mixed", path=str(path))
+    with pytest.raises(NotApplicableError, match="trained with the labels"):
+        make_diagnoser("pca", b747, path=str(path))
+    with pytest.raises(
+        NotApplicableError, match=r"train them: fdi-gym train minirocket B747Lateral --options sensor_faults true"
+    ):
+        make_diagnoser("minirocket", plant, process="mixed")
+
+
 def test_a_run_leaves_a_card_and_a_log(tiny):
     card = weights.read_card(tiny)
     assert card.env == "B747Lateral-Faults-v0"
@@ -444,9 +461,10 @@ def test_without_weights_or_a_library_the_reason_is_given(monkeypatch, tmp_path)
             make_diagnoser(name, build("B747Lateral"))
 
 
+@pytest.mark.parametrize("sensor_faults", [False, True])
 @pytest.mark.parametrize("plant_id", PLANTS)
-def test_recipes_name_what_exists(plant_id):
-    plant = build(plant_id)
+def test_recipes_name_what_exists(plant_id, sensor_faults):
+    plant = build(plant_id, sensor_faults=sensor_faults)
     for condition in recipes.sequence_recipe(plant).conditions:
         assert condition.process in flights.plant_under(plant, condition).processes
     for name in recipes.residual_recipe(plant).filters:

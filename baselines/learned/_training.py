@@ -145,7 +145,7 @@ class Training(ABC, Generic[R]):
         """
         began = time.perf_counter() - self.seconds
         until = self.rounds if stop_after is None else min(stop_after, self.rounds)
-        bar = tqdm(total=self.rounds, initial=self.done, desc=f"{self.method} {self.plant.id}", unit=self.unit)
+        bar = tqdm(total=self.rounds, initial=self.done, desc=weights.stem(self.method, self.plant), unit=self.unit)
         with SummaryWriter(str(self.work / "tensorboard")) as log, bar:
             while self.done < until:
                 score = self.learn()
@@ -178,7 +178,7 @@ class Training(ABC, Generic[R]):
             budget={**own.pop("budget"), "seconds": round(self.seconds, 1)},
             curve=self.curve, command=self.command, revision=revision, versions=versions, **own,
         )  # fmt: skip
-        path = self.work / f"{self.method}-{self.plant.id}.safetensors"
+        path = self.work / f"{weights.stem(self.method, self.plant)}.safetensors"
         weights.write(path, self.tensors(), card)
         return path
 

@@ -122,7 +122,7 @@ def train_minirocket(plant: Plant, *, budget: int | None = None, seed: int = 0, 
     return classifier.train("minirocket", plant, recipe, seed, work, learn, shape, command)
 
 
-@diagnoser("minirocket", "MiniRocket on windows of the channels, ridge classifier")
+@diagnoser("minirocket", "MiniRocket on windows of the channels, ridge classifier", sensors=True)
 def minirocket(plant: Plant, calibration: Calibration, *, process: str = "standard", path: str = "") -> Diagnoser:
     """The classifier with its decision.
 

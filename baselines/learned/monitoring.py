@@ -273,9 +273,11 @@ def monitor_filter(plant: Plant, stride: int, length: int, monitor: Monitor, pac
     return Filter(start, lambda s, at: s, update, read)
 
 
-@diagnoser("pca", "Principal components of the channels at one step, T^2 and SPE", method="pca")
-@diagnoser("dynamic_pca", "Principal components of the channels over several steps, T^2 and SPE", method="dynamic_pca")
-@diagnoser("cva", "Canonical variates of past channels and future outputs, T^2 and Q", method="cva")
+@diagnoser("pca", "Principal components of the channels at one step, T^2 and SPE", sensors=True, method="pca")
+@diagnoser(
+    "dynamic_pca", "Principal components of the channels over several steps, T^2 and SPE", sensors=True, method="dynamic_pca"
+)
+@diagnoser("cva", "Canonical variates of past channels and future outputs, T^2 and Q", sensors=True, method="cva")
 def monitoring(
     plant: Plant,
     calibration: Calibration,

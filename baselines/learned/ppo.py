@@ -64,6 +64,6 @@ def train_ppo(
     from baselines.learned._reinforcement import PolicyTraining
 
     return PolicyTraining(
-        method, plant, policy_recipe(plant, task, budget), seed=seed, work=work / f"{method}-{plant.id}-{seed}",
+        method, plant, policy_recipe(plant, task, budget), seed=seed, work=work / f"{weights.stem(method, plant)}-{seed}",
         command=weights.command(method, plant, budget, seed), threads=threads,
     ).run()  # fmt: skip

@@ -146,12 +146,14 @@ def sequence_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
         names = names or [name for name in plant.processes if name != "fault-free"]
         shape = FeatureShape(stride=5, lags=6, degree=2)
         found = SequenceRecipe(conditions=tuple(Condition(name, {}) for name in names), shape=shape)
+    if plant.bare is not None:  # sensors may fail too: the one process that shows all labels
+        found = replace(found, conditions=(Condition("mixed", found.conditions[0].options),))
     return found if budget is None else replace(found, flights=budget, chunk=min(found.chunk, budget))
 
 
 def residual_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
     """The recipe of the network that is shown filters too; arguments as in `sequence_recipe`."""
-    filters, most = FILTERS.get(plant.id, GENERAL_FILTERS)
+    filters, most = FILTERS.get(plant.id, GENERAL_FILTERS) if plant.bare is None else GENERAL_FILTERS
     flights = most if budget is None else budget
     chunk = min(most, flights)
     return replace(

@@ -111,10 +111,11 @@ def train_sequence_net(
     from baselines.learned._supervised import SupervisedTraining
 
     recipe = (residual_recipe if method == "residual_net" else sequence_recipe)(plant, budget)
-    file = f"sequence_net-{plant.id}.safetensors"
-    own = work / f"sequence_net-{plant.id}-{seed}" / file
+    name = weights.stem("sequence_net", plant)
+    file = f"{name}.safetensors"
+    own = work / f"{name}-{seed}" / file
     return SupervisedTraining(
-        method, plant, recipe, seed=seed, work=work / f"{method}-{plant.id}-{seed}",
+        method, plant, recipe, seed=seed, work=work / f"{weights.stem(method, plant)}-{seed}",
         base=own if own.exists() else weights.WEIGHTS / file, command=weights.command(method, plant, budget, seed),
         threads=threads,
     ).run()  # fmt: skip

@@ -172,8 +172,8 @@ def checked(path: Path, forest: dict[str, Array], features: int, labels: int) ->
     return {name: contiguous(value) for name, value in f.items()}
 
 
-@diagnoser("boosted_trees", "Gradient-boosted trees on windows of the channels", method="boosted_trees")
-@diagnoser("random_forest", "Random forest on windows of the channels", method="random_forest")
+@diagnoser("boosted_trees", "Gradient-boosted trees on windows of the channels", sensors=True, method="boosted_trees")
+@diagnoser("random_forest", "Random forest on windows of the channels", sensors=True, method="random_forest")
 def trees(
     plant: Plant, calibration: Calibration, *, method: str = "boosted_trees", process: str = "standard", path: str = ""
 ) -> Diagnoser:

@@ -139,9 +139,15 @@ def write(path: Path, tensors: dict[str, Array], card: Card) -> None:
     write_whole(path.with_suffix(".json"), msgspec.json.format(msgspec.json.encode(card), indent=1) + b"\n")
 
 
+def stem(method: str, plant: Plant) -> str:
+    """The name of a method's weights for a plant; where its sensors may fail they are others."""
+    return f"{method}-{plant.id}" + ("" if plant.bare is None else "-sensors")
+
+
 def command(method: str, plant: Plant, budget: int | None, seed: int) -> str:
     """What to type to train the same weights again."""
-    parts = ["fdi-gym train", method, plant.id, f"--budget {budget}" if budget else "", f"--seed {seed}" if seed else ""]
+    parts = ["fdi-gym train", method, plant.id, "" if plant.bare is None else "--options sensor_faults true",
+             f"--budget {budget}" if budget else "", f"--seed {seed}" if seed else ""]  # fmt: skip
     return " ".join(part for part in parts if part)
 
 
@@ -172,7 +178,7 @@ def deliver(
         processes=[c.process for c in recipe.conditions], **names(plant),  # type: ignore[arg-type]
         seeds=seeds | card.pop("seeds", {}), command=command, revision=revision, versions=versions, **card,
     )  # fmt: skip
-    path = work / f"{method}-{plant.id}-{seed}" / f"{method}-{plant.id}.safetensors"
+    path = work / f"{stem(method, plant)}-{seed}" / f"{stem(method, plant)}.safetensors"
     write(path, tensors, found)
     return path
 
@@ -254,9 +260,9 @@ def find(method: str, plant: Plant, path: str = "") -> tuple[Path, dict[str, Arr
         NotApplicableError: There are none for this plant and its options.
         RefusedError: As `read`.
     """
-    file = Path(path) if path else WEIGHTS / f"{method}-{plant.id}.safetensors"
+    file = Path(path) if path else WEIGHTS / f"{stem(method, plant)}.safetensors"
     if not file.exists():
-        raise NotApplicableError(f"no trained weights for {plant.id}; train them: fdi-gym train {method} {plant.id}")
+        raise NotApplicableError(f"no trained weights for {plant.id}; train them: {command(method, plant, None, 0)}")
     return file, *read(file, plant)
 
 

@@ -52,9 +52,9 @@ def ppo_probes(
         NotApplicableError: No weights for this plant, its options, process and period.
         RefusedError: Weights or a card that are not what they should be.
     """
-    file = Path(path) if path else FOLDER / f"{method}-{plant.id}.safetensors"
+    file = Path(path) if path else FOLDER / f"{weights.stem(method, plant)}.safetensors"
     if not file.exists():
-        raise NotApplicableError(f"no trained weights for {plant.id}; train them: fdi-gym train {method} {plant.id}")
+        raise NotApplicableError(f"no trained weights for {plant.id}; train them: {weights.command(method, plant, None, 0)}")
     tensors, card = weights.read(file, plant)
     if (card.processes, card.shape.get("period")) != ([process], period):
         told = f"the process {card.processes[0]!r} and a period of {card.shape.get('period')}"
@@ -144,6 +144,6 @@ def train_ppo_probes(
     changes: dict[str, Any] = {"cost_weight": cost_weight, "discount": discount, "recurrent": recurrent}
     changes |= {} if budget is None else {"decisions": budget}
     return ProbingTraining(
-        method, plant, recipe_of(plant, **changes), seed=seed, work=work / f"{method}-{plant.id}-{seed}",
+        method, plant, recipe_of(plant, **changes), seed=seed, work=work / f"{weights.stem(method, plant)}-{seed}",
         command=weights.command(method, plant, budget, seed), threads=threads,
     ).run()  # fmt: skip

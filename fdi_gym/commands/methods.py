@@ -74,6 +74,7 @@ def train(
     plant: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PLANT")],
     budget: int | None = None,
     seed: int = 0,
+    options: Annotated[dict[str, str], tyro.conf.arg(metavar="OPTION VALUE")] = {},  # noqa: B006 (tyro reads the default)
     work: Path = Path("runs"),
     threads: int = 1,
     output: Path | None = None,
@@ -85,6 +86,7 @@ def train(
         plant: Plant or environment id; "module:id" where the module registers it.
         budget: How much to train: flights per process, or for reinforcement learning agent steps. Default: the recipe's.
         seed: Of the run.
+        options: Options of the plant, as name and value in turn; with sensor_faults it learns the sensors' labels too.
         work: Folder of runs: checkpoint, tensorboard log, weights and card.
         threads: Of the library that trains.
         output: Folder that gets a copy of weights and card.
@@ -93,8 +95,11 @@ def train(
     from fdi_gym.discovery import load_plant
     from fdi_gym.files import write_whole
     from fdi_gym.listing import find_plant
+    from fdi_gym.suite import checked_options
 
-    path = run(method, load_plant(find_plant(plant)[1]), budget=budget, seed=seed, work=work, threads=threads)
+    plant_id = find_plant(plant)[1]
+    built = load_plant(plant_id, **checked_options(plant_id, options, typed=False))
+    path = run(method, built, budget=budget, seed=seed, work=work, threads=threads)
     for suffix in (".safetensors", ".json"):
         if output is not None:
             output.mkdir(parents=True, exist_ok=True)
