@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from fdi_gym.comparison import Drawn, draw_again
-from fdi_gym.diagnosis import probers
+from fdi_gym.acted import NEVER, Acted, accuracy, at_this_cost, delays, family, horizon, shares, truths
 from fdi_gym.entrants import NOTHING, TRUTH, fly_entrant
 from fdi_gym.intervals import mean_interval
-from fdi_gym.metrics import Outcome
-from fdi_gym.plant import Array, Plant
 from fdi_gym.row import Row
-from fdi_gym.scores import costs
-from fdi_gym.suite import ActingSuite
-from fdi_gym.tables import FLOOR, clairvoyant, markdown, plain
+from fdi_gym.tables import FLOOR, clairvoyant, knows, markdown, plain, told
 
-BLIND = ("periodic_probes", "random_probes")  # builders of probers that look at nothing: others are held against them
-NEVER = "never"  # the family of those that don't probe
 WORSE = 1.05  # a flight is worse where it costs more than so many times what it costs with nothing
 
 PROBING = """An entrant is a diagnoser that never probes, or a prober with `{on_board}` on board that chooses a probe every
@@ -37,88 +30,6 @@ and "caused" are flights that leave their envelope with nothing and not with the
 those without a fault, which a false alarm has caused; "worse" is the share of faulty flights that cost 5 % more than
 with nothing. Intervals are 95 %, by resampled flights.
 """
-
-
-class Acted(NamedTuple):
-    """The rows of a suite with what they are compared by."""
-
-    suite: ActingSuite
-    plant: Plant
-    rows: list[Row]
-    outcomes: Mapping[str, list[Outcome]]
-
-    def cost(self, name: str) -> Array:
-        """The cost of each flight."""
-        return costs(self.outcomes[name])
-
-    def drawn(self, kind: str = "per_sample") -> Drawn:
-        """All rows on resamples of the flights."""
-        return draw_again(dict(self.outcomes), len(self.plant.labels), kind)
-
-    def passive(self) -> Row | None:
-        """The best row that never probes and is told nothing."""
-        mine = [row for row in self.rows if family(row) == NEVER and not clairvoyant(row)]
-        return max(mine, key=accuracy, default=None)
-
-    def chosen(self) -> Row | None:
-        """The best row of a prober that looks; of any where none does."""
-        mine = [row for row in self.rows if family(row) != NEVER]
-        return max([row for row in mine if family(row) not in BLIND] or mine, key=accuracy, default=None)
-
-
-def accuracy(row: Row) -> float:
-    """Balanced accuracy per sample."""
-    return row.metrics["per_sample"]["balanced_accuracy"] or 0.0
-
-
-def family(row: Row) -> str:
-    """Whose curve a row is on: the builder of its prober, its own where it is not installed, or `NEVER`."""
-    entry = probers().get(row.diagnoser)
-    if entry is not None:
-        return entry.build.__name__
-    return row.diagnoser if ":" in row.diagnoser and row.metrics["acting"]["probed"] > 0 else NEVER
-
-
-def delays(outcomes: Sequence[Outcome], horizon: int, dt: float) -> Array:
-    """Time [s] from each flight's first onset to its right label, the horizon [samples] where longer; nan where healthy."""
-    found = []
-    for flight in outcomes:
-        first = flight.onsets[0] if flight.onsets else None
-        late = horizon if first is None or first.isolation is None else min(first.isolation, horizon)
-        found.append(np.nan if first is None else 0.0 if first.labelled else late * dt)
-    return np.array(found)
-
-
-def horizon(outcomes: Sequence[Outcome]) -> int:
-    """Samples of the median flight's first fault."""
-    lengths = [flight.onsets[0].length for flight in outcomes if flight.onsets]
-    return int(np.median(lengths)) if lengths else 0
-
-
-def at_this_cost(acted: Acted, drawn: Drawn, row: Row) -> tuple[float, float, float] | None:
-    """Accuracy of a row more than that of the best mixture of two rows which do not look and cost the same on average.
-
-    None where no two have its cost between them.
-    """
-    if family(row) in (*BLIND, NEVER):
-        return None
-    passive, mine = acted.passive(), float(acted.cost(row.diagnoser).mean())
-    blind = [r.diagnoser for r in acted.rows if family(r) in BLIND] + ([passive.diagnoser] if passive else [])
-    price = {name: float(acted.cost(name).mean()) for name in blind}
-    best: tuple[float, Array] | None = None
-    for a in blind:
-        for b in blind:
-            if price[a] <= mine < price[b]:
-                share = (price[b] - mine) / (price[b] - price[a])
-                i, j = drawn.names.index(a), drawn.names.index(b)
-                score = share * drawn.score[i] + (1.0 - share) * drawn.score[j]
-                if best is None or score > best[0]:
-                    best = float(score), share * drawn.again[:, i] + (1.0 - share) * drawn.again[:, j]
-    if best is None:
-        return None
-    k = drawn.names.index(row.diagnoser)
-    gap, reach = float(drawn.score[k] - best[0]), 1.96 * float(np.std(drawn.again[:, k] - best[1]))
-    return gap, gap - reach, gap + reach
 
 
 def said(value: Sequence[float] | None, digits: int = 3, factor: float = 1.0) -> str:
@@ -144,42 +55,16 @@ def probing_table(acted: Acted, width: int | None = None) -> str:
             added = mean_interval(acted.cost(name) - acted.cost(passive.diagnoser))
         mean = m["detection"]["isolation_delay_restricted_mean"]
         alarms = m["detection"]["false_alarms_per_hour"]
+        passed = [[v["balanced_accuracy"], *v["balanced_accuracy_interval"]] for v in (m["per_sample"], m["per_decision"])]
         lines.append([
-            plain(name), *(said([v["balanced_accuracy"], *v["balanced_accuracy_interval"]], 1, 100.0)
-                           for v in (m["per_sample"], m["per_decision"])),
-            said(gain, 1, 100.0), "-" if mean is None else f"{mean:.2f}", said(late, 2), said(added),
+            plain(name) + (" *" if clairvoyant(row) else ""), *(said(v, 1, 100.0) for v in passed), said(gain, 1, 100.0),
+            "-" if mean is None else f"{mean:.2f}", said(late, 2), said(added),
             said(at_this_cost(acted, drawn, row), 1, 100.0), f"{100 * m['acting']['probed']:.0f}",
             "-" if alarms is None else f"{alarms:.1f}",
         ])  # fmt: skip
     head = ["entrant", "per sample %", "per decision %", "more than the best passive", "isolated after s",
             "later than the best passive s", "added cost", "more at this cost", "probed %", "false alarms/h"]  # fmt: skip
     return markdown(head, lines, width)
-
-
-def truths(outcomes: Sequence[Outcome]) -> Array:
-    """The label of each flight's first fault, 0 where it has none."""
-    return np.array([flight.onsets[0].label if flight.onsets else 0 for flight in outcomes])
-
-
-def recovered(nothing: Array, mine: Array, truth: Array) -> tuple[float, float, float] | None:
-    """The share of what the truth recovers, of sums over flights, with its interval from resampled flights.
-
-    None where the truth recovers no more than chance.
-    """
-    if len(truth) < 2 or mean_interval(nothing - truth)[1] <= 0:
-        return None
-    drawn = np.random.default_rng(0).integers(len(mine), size=(2000, len(mine)))
-    gained, possible = (nothing - mine)[drawn].sum(axis=1), (nothing - truth)[drawn].sum(axis=1)
-    low, high = np.percentile(gained / np.maximum(possible, 1e-12), [2.5, 97.5])
-    return float((nothing - mine).sum() / (nothing - truth).sum()), float(low), float(high)
-
-
-def shares(acted: Acted, name: str, mask: Array | None = None) -> tuple[float, float, float] | None:
-    """What an entrant recovers, of some of the flights; None where nothing or the truth has no row, too."""
-    if not {NOTHING, TRUTH.name} <= set(acted.outcomes):
-        return None
-    chosen = np.ones(acted.suite.episodes, bool) if mask is None else mask
-    return recovered(*(acted.cost(n)[chosen] for n in (NOTHING, name, TRUTH.name)))
 
 
 def accommodation_table(acted: Acted, width: int | None = None) -> str:
@@ -238,17 +123,24 @@ def verdict(acted: Acted) -> str:
     added = mean_interval(acted.cost(name) - acted.cost(passive.diagnoser))
     gap = late[passive.diagnoser]
     when = f"{said(gap, 2)} s later" if gap[0] > 0 else f"{said((-gap[0], -gap[2], -gap[1]), 2)} s sooner"
-    return (
+    words = (
         f"The best chosen probing, `{name}`, has {said(gain, 1, 100.0)} points of accuracy per sample more than the best "
         f"that never probes, and isolates {when}, at a cost of {said(added)}: it "
         f"{'beats every entrant that never probes' if sure else 'does not beat every entrant that never probes'} in both."
     )
+    oracle = acted.passive(told=True)
+    if oracle is not None:
+        words += (
+            f" `{oracle.diagnoser}`, which knows {knows(oracle)} and never probes, has {100 * accuracy(oracle):.1f} %: "
+            f"{said(drawn.difference(name, oracle.diagnoser), 1, 100.0)} more has the chosen probing."
+        )
+    return words
 
 
 def tables(acted: Acted, width: int | None = None) -> str:
     """The tables of a suite."""
     if acted.suite.acts == "probing":
-        return probing_table(acted, width)
+        return "\n\n".join(part for part in (probing_table(acted, width), told(acted.rows)) if part)
     return f"{accommodation_table(acted, width)}\n\nCost by fault:\n\n{by_fault_table(acted, width)}"
 
 
@@ -284,9 +176,14 @@ def draw(acted: Acted, folder: Path) -> None:
         plots.allowances(points, title).savefig(folder / f"{suite.name}.png")
         return
     curves: dict[str, list[plots.Point]] = {}
+    oracle = acted.passive(told=True)
     for row in acted.rows:
+        kind = family(row)
+        if kind == NEVER and row not in (passive, oracle):
+            continue  # they all cost nothing: the best says enough
         added = acted.cost(row.diagnoser) - (0.0 if passive is None else acted.cost(passive.diagnoser))
-        curves.setdefault(family(row), []).append(plots.Point(row.diagnoser, _passed(row), mean_interval(added)))
+        place = f"{kind}: {row.diagnoser}{', told' if row is oracle else ''}" if kind == NEVER else kind
+        curves.setdefault(place, []).append(plots.Point(row.diagnoser, _passed(row), mean_interval(added)))
     plots.pareto(curves, f"{title}; {suite.on_board} on board").savefig(folder / f"{suite.name}.png")
     if passive is not None and chosen is not None:
         flight(acted, (passive.diagnoser, chosen.diagnoser)).savefig(folder / f"{suite.name}-flight.png")

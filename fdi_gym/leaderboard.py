@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from fdi_gym import acting_board
-from fdi_gym.acting_board import Acted
+from fdi_gym.acted import Acted
 from fdi_gym.comparison import Drawn, cliques, draw_again, tied_with_best
 from fdi_gym.files import RefusedError
 from fdi_gym.metrics import Outcome

@@ -4,8 +4,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from fdi_gym import acting_board, cli, export, leaderboard, rounds
-from fdi_gym.acting_board import Acted
+from fdi_gym import cli, export, leaderboard, rounds
+from fdi_gym.acted import Acted, at_this_cost, recovered
 from fdi_gym.diagnosis import find_diagnoser, probers
 from fdi_gym.entrants import TRUTH, find_entrant, fly_entrant, make_entrant
 from fdi_gym.files import RefusedError
@@ -198,11 +198,11 @@ def test_the_truth_recovers_all_and_nothing_recovers_nothing():
     rng = np.random.default_rng(0)
     truth, fault = rng.uniform(1, 2, 50), rng.uniform(0.5, 1.5, 50)
     nothing = truth + fault
-    assert acting_board.recovered(nothing, truth, truth) == (1.0, 1.0, 1.0)
-    assert acting_board.recovered(nothing, nothing, truth) == (0.0, 0.0, 0.0)
-    half = acting_board.recovered(nothing, truth + fault / 2, truth)
+    assert recovered(nothing, truth, truth) == (1.0, 1.0, 1.0)
+    assert recovered(nothing, nothing, truth) == (0.0, 0.0, 0.0)
+    half = recovered(nothing, truth + fault / 2, truth)
     assert half == pytest.approx((0.5, 0.5, 0.5))
-    assert acting_board.recovered(truth, truth, truth + rng.normal(size=50)) is None
+    assert recovered(truth, truth, truth + rng.normal(size=50)) is None
 
 
 def test_one_that_looks_is_held_against_the_mixture_of_its_cost(here):
@@ -211,9 +211,9 @@ def test_one_that_looks_is_held_against_the_mixture_of_its_cost(here):
     row = next(r for r in acted.rows if r.diagnoser == "greedy_probes")
     for twin in ("periodic_probes_30", "augmented_ekf"):
         same = acted._replace(outcomes={**acted.outcomes, "greedy_probes": acted.outcomes[twin]})
-        gap = acting_board.at_this_cost(same, same.drawn(), row)
+        gap = at_this_cost(same, same.drawn(), row)
         assert gap is None or gap == pytest.approx((0.0, 0.0, 0.0))
-    assert acting_board.at_this_cost(acted, acted.drawn(), acted.passive()) is None
+    assert at_this_cost(acted, acted.drawn(), acted.passive()) is None
 
 
 def test_pages_hold_every_row_and_are_drawn(here, tmp_path):

@@ -1,16 +1,18 @@
 """Who enters the suites whose flights are acted on."""
 
+from fdi_gym.diagnosis import diagnosers
+
 ALLOWING = ("null", "truth", "false_alarm", "random")
 PROBING = ("periodic_probes_10", "periodic_probes_30", "always_probes", "random_probes_30", "greedy_probes")
+EVERY = tuple(diagnosers())  # of whom those enter that can run on the plant
 
 ENTRANTS = {
     "b747-active": (
-        "bayes_bank", "two_stage_kf", "augmented_ekf", "multiple_model_ekf", "periodic_probes_5", *PROBING,
-        "greedy_probes_w3", "greedy_probes_w10", "ppo_probes", "ppo_probes_w3", "ppo_probes_discount_0",
-        "recurrent_ppo_probes",
+        *EVERY, "periodic_probes_5", *PROBING, "greedy_probes_w0.3", "greedy_probes_w3", "greedy_probes_w10", "ppo_probes",
+        "ppo_probes_w3", "ppo_probes_discount_0", "recurrent_ppo_probes",
     ),
-    "cmg-active": ("mekf", "augmented_ekf", *PROBING),
-    "huav-active": ("hypothesis_bank", "augmented_ekf", "multiple_model_ekf", *PROBING, "greedy_probes_w0.3"),
+    "cmg-active": (*EVERY, *PROBING),
+    "huav-active": ("multiple_model_ekf", "hypothesis_bank", "augmented_ekf", *PROBING, "greedy_probes_w0.3"),
     "missile-active": ("augmented_ekf", "mode_pursuit_ekf", *PROBING, "greedy_probes_w0.3"),
     "tank-active": ("mode_pursuit_ekf", "augmented_ekf", *PROBING, "greedy_probes_w0.3"),
     "b747-accommodation": (*ALLOWING, "bayes_bank", "two_stage_kf", "augmented_ekf"),
