@@ -59,6 +59,7 @@ def on_config(config: Any) -> Any:
         "@boards": ["boards/README.md", {"Grid of methods and plants": "boards/grid.md"},
                     {"Learned": "boards/learning/README.md"}, {"Coverage of the intervals": "boards/coverage.md"},
                     {"Bounds with probes": "boards/acting-bounds.md"}, {"Sensors": "boards/sensors.md"},
+                    {"Unseen faults": "boards/unseen.md"},
                     {"Missing samples": "boards/gaps.md"},
                     {"Structural isolability": "boards/isolability.md"},
                     *({path.stem: f"boards/{path.name}"} for path in sorted(BOARDS.glob("*-*.md"))

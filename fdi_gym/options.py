@@ -12,9 +12,10 @@ from fdi_gym.faults import Sampling
 from fdi_gym.plant import Plant
 from fdi_gym.sensors import with_sampling, with_sensor_faults
 from fdi_gym.simultaneous import with_simultaneous
+from fdi_gym.unseen import with_unseen
 
 FEEDBACK = ("faulty", "healthy")
-LASTING = ("sensor_faults", "simultaneous", "feedback", "delays")  # what a method may know
+LASTING = ("sensor_faults", "unseen", "simultaneous", "feedback", "delays")  # what a method may know
 
 
 class Options(msgspec.Struct, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
@@ -22,6 +23,7 @@ class Options(msgspec.Struct, kw_only=True, omit_defaults=True, forbid_unknown_f
 
     Args:
         sensor_faults: Its sensors may fail (`fdi_gym.sensors`).
+        unseen: It meets faults that no method was told of (`fdi_gym.unseen`).
         simultaneous: Any of its faults may act at once (`fdi_gym.simultaneous`).
         feedback: What the controller gets from a sensor that fails: what it says ("faulty"), or what a healthy one would
             ("healthy").
@@ -29,6 +31,7 @@ class Options(msgspec.Struct, kw_only=True, omit_defaults=True, forbid_unknown_f
     """
 
     sensor_faults: bool = False
+    unseen: bool = False
     simultaneous: bool = False
     feedback: str = "faulty"
     dropout: float = 0.0
@@ -50,6 +53,8 @@ class Options(msgspec.Struct, kw_only=True, omit_defaults=True, forbid_unknown_f
         sampling = msgspec.convert({name: getattr(self, name) for name in fields}, Sampling)
         if self.sensor_faults:
             plant = with_sensor_faults(plant)
+        if self.unseen:
+            plant = with_unseen(plant)
         if self.simultaneous:
             plant = with_simultaneous(plant)
         if self.feedback == "healthy":

@@ -90,6 +90,7 @@ class Plant(Truth):
         healthy_feedback: The controller gets what healthy sensors would say, each at every sample.
         simultaneous: Any of its modes may act at once, in sets for which there is no label (`fdi_gym.simultaneous`).
         bare: Of a plant whose sensors may fail (`fdi_gym.sensors`): the same without.
+        unseen: One of its labels is that of faults that no method is told of (`fdi_gym.unseen`).
         regular: Of a plant whose sensors leave samples out: the same with sensors that report at every one.
         physical: Maps a scenario's physical parameters to the vector p; of {} it gives the nominal model.
         perturb: Draws physical parameters at a level of mismatch: perturb(rng, level) -> dict, or None if it has none.
@@ -135,6 +136,7 @@ class Plant(Truth):
     healthy_feedback: bool = False
     simultaneous: bool = False
     bare: Plant | None = None
+    unseen: bool = False
     regular: Plant | None = None
     physical: Callable[[Mapping[str, Any]], Array] = _no_change
     perturb: Callable[[np.random.Generator, float], Mapping[str, Any]] | None = None

@@ -52,8 +52,10 @@ def with_simultaneous(plant: Plant) -> Plant:
     """The plant whose modes may act in any set, with a process "simultaneous" that draws up to three.
 
     Raises:
-        ValueError: It has too many modes, or a process of that name.
+        ValueError: It has too many modes, a process of that name, or faults that no method is told of.
     """
+    if plant.unseen:
+        raise ValueError(f"{plant.id}: unseen faults are one at a time: not simultaneous")
     if len(plant.modes) > MODES:
         raise ValueError(f"{plant.id} has {len(plant.modes)} modes; of at most {MODES} any set may act")
     if "simultaneous" in plant.processes:

@@ -24,11 +24,13 @@ import numpy as np
 
 from fdi_gym.clusters import in_order
 from fdi_gym.diagnosis import fitting
+from fdi_gym.diagnosis.conforming import fit_conformity
 from fdi_gym.diagnosis.fitting import fit_belief, fit_calibration
 from fdi_gym.diagnosis.registry import Entry, find_diagnoser, package_of
 from fdi_gym.discovery import plant_sources
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
+from fdi_gym.estimation.conformity import Conformity
 from fdi_gym.estimation.data import from_json, to_json
 from fdi_gym.files import write_whole
 from fdi_gym.kernels import cache_folder, sources
@@ -42,6 +44,7 @@ class Fits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     code: str
     beliefs: dict[str, Belief] = {}
     calibrations: dict[str, Calibration] = {}
+    conformities: dict[str, Conformity] = {}
 
 
 def code_digest(plant: Plant) -> str:
@@ -83,6 +86,7 @@ def fits_file(folder: Path, plant_id: str) -> Fits | None:
 
 
 _kept: dict[str, Any] = {}
+_KINDS = {"beliefs": Belief, "calibrations": Calibration, "conformities": Conformity}
 
 
 def _known(entry: Entry, plant: Plant, kind: str, key: str, make: Any) -> Any:
@@ -95,7 +99,7 @@ def _known(entry: Entry, plant: Plant, kind: str, key: str, make: Any) -> Any:
             return found
     place = f"{plant.env_id} {code} {kind} {key} {_fitting()}"
     if place not in _kept:
-        _kept[place] = _on_disk(entry, place, Belief if kind == "beliefs" else Calibration, make)
+        _kept[place] = _on_disk(entry, place, _KINDS[kind], make)
     return _kept[place]
 
 
@@ -128,7 +132,7 @@ def _on_disk(entry: Entry, place: str, of: Any, make: Any) -> Any:
 
 
 def knowledge_of(entry: Entry, plant: Plant, process: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The belief and the calibration that a method's builder takes: shipped, or found now and kept for the session.
+    """The belief, calibration and conformity that a method's builder takes: shipped, or found now and kept for the session.
 
     Nobody is told which samples go missing: what is known is that of sensors which report at every one.
 
@@ -148,6 +152,11 @@ def knowledge_of(entry: Entry, plant: Plant, process: str, settings: Mapping[str
             entry, plant, "calibrations", key,
             lambda: fit_calibration(entry, plant, process, settings, found.get("belief")),
         )  # fmt: skip
+    if entry.takes("conformity"):
+        key = calibration_key(entry, plant, process, settings)
+        found["conformity"] = _known(
+            entry, plant, "conformities", key, lambda: fit_conformity(entry, plant, process, settings)
+        )
     return found
 
 

@@ -44,6 +44,7 @@ GIVEN: dict[Kind, dict[str, str]] = {  # arguments that are no settings
     "diagnoser": {
         "belief": "what it may assume of the plant, fitted to the process",
         "calibration": "when it alarms, fitted to the process",
+        "conformity": "how badly each label may fit, fitted to the process",
         "process": "the fault process that will be met",
         "scenarios": "the truth: it is clairvoyant",
     },
@@ -81,10 +82,18 @@ class Entry(NamedTuple):
     def told(self, plant: Plant, process: str) -> tuple[Plant, str]:
         """The plant and the process as the method knows them: that of other methods has sensors that never fail.
 
+        Of faults that nobody is told of, nobody is told; who takes a conformity has an answer for them.
+
         Raises:
-            NotApplicableError: It knows a part of the truth, but not of sensors that fail.
+            NotApplicableError: It knows a part of the truth, but not of sensors that fail, or its answer is no label.
         """
-        if plant.bare is None or self.hears_sensors:
+        if self.takes("conformity"):
+            if not plant.unseen or plant.bare is None:
+                raise NotApplicableError(
+                    f"{plant.id} has no label for what nobody was told of; with the option unseen it has"
+                )
+            return plant, process if process in plant.bare.processes else "standard"
+        if plant.bare is None or (self.hears_sensors and not plant.unseen):
             return plant, process
         if self.clairvoyant:
             raise NotApplicableError(f"what {self.name} is told of the truth does not cover faults of sensors")
