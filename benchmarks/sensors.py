@@ -1,6 +1,6 @@
 """What is found of failing sensors, plant by plant and kind by kind, and whether they are told from the plant's own faults.
 
-    python benchmarks/sensors.py [PLANT ...] [--methods augmented_ekf multiple_model_ekf told_onset_bank] [--flights 40]
+    python benchmarks/sensors.py [PLANT ...] [--methods augmented_ekf told_source_oracle] [--flights 40]
                                  [--page leaderboards/sensors.md]
 
 Flights whose sensors fail in one way each, flights with the plant's own standard faults, and healthy ones; the methods know
@@ -26,16 +26,16 @@ from fdi_gym.sensors import KINDS, of_kind
 from fdi_gym.tables import markdown
 
 FIRST = 4_600_000  # seed; neither test nor validation nor training flights
-METHODS = ("augmented_ekf", "multiple_model_ekf", "told_onset_bank")
+METHODS = ("augmented_ekf", "multiple_model_ekf", "sequence_net", "told_source_oracle")
 INTRODUCTION = """# Sensors that fail
 
 Written by `python benchmarks/sensors.py --page leaderboards/sensors.md`. In each row flights in which a sensor fails in one
 way (`fdi_gym.sensors` says how much), in which the plant's own standard faults act, or healthy ones; a method knows the
 process "mixed", not which of these it meets, and what counts is what it declares at the flight's last sample.
-`told_onset_bank` is told when the label changes, and starts its hypotheses then; `told_source_oracle` is also told whether
-a sensor fails. Percent, with 95 % intervals (Clopper and
-Pearson); the delay is the median time from the onset to the alarm of those that are found. "as the plant's" are flights
-whose sensor failed and that are called one of the plant's own faults; for the plant's own faults it is the reverse.
+`sequence_net` was trained on that process, where it is there; `told_source_oracle` is a ceiling: it is told when the label
+changes and whether a sensor fails. Percent, with 95 % intervals (Clopper and Pearson); the delay is the median time from the
+onset to the alarm of those that are found. "as the plant's" are flights whose sensor failed and that are called one of the
+plant's own faults; for the plant's own faults it is the reverse.
 """
 
 

@@ -7,12 +7,22 @@ from conftest import PLANTS
 from scipy.stats import binom
 
 from baselines import conformal
-from fdi_gym.diagnosis import Diagnoser, Diagnosis, NotApplicableError, conforming, find_diagnoser, make_diagnoser, run
+from fdi_gym.diagnosis import (
+    Diagnoser,
+    Diagnosis,
+    NotApplicableError,
+    conforming,
+    find_diagnoser,
+    knowledge,
+    make_diagnoser,
+    run,
+)
 from fdi_gym.diagnosis.conforming import decided, decisive, of_each_label
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
 from fdi_gym.estimation.conformity import Conformity
 from fdi_gym.faults import draw
+from fdi_gym.suite import Suite
 from fdi_gym.unseen import SOMETHING_ELSE, with_unseen
 
 
@@ -145,6 +155,22 @@ def test_known_flights_are_known_and_unseen_ones_are_not_named():
     after = decided(with_it, plant, unseen)[2]
     assert (after == other).mean() > 0.4
     assert ((after > 0) & (after < other)).sum() < (before > 0).sum() / 2
+
+
+def test_what_a_suite_needs_is_fitted_for_it(monkeypatch):
+    """For those that have the answer; the others know what they know of the plant without."""
+    monkeypatch.setattr(conforming, "EACH", 2)
+    suite = Suite(name="few", description="a test", env="B747Lateral-Faults-v0", plant="B747Lateral", process="unseen",
+                  options={"unseen": True}, mismatch=None, seeds=[1, 2], settings={})  # fmt: skip
+    entries = [find_diagnoser(name) for name in ("conformal_sequence_net", "augmented_ekf", "conformal_hypothesis_bank")]
+    (fits,) = knowledge.fit_suites(entries, [suite], jobs=1).values()
+    assert not fits.beliefs
+    assert not fits.calibrations
+    ((key, found),) = fits.conformities.items()  # the bank cannot run on this plant
+    assert key.startswith('["conformal_sequence_net", "standard"')
+    plant = suite.build().bare
+    assert list(found.scores) == [label.name for label in plant.labels]
+    assert all(len(scores) == 2 and scores == sorted(scores) for scores in found.scores.values())
 
 
 @pytest.mark.parametrize(

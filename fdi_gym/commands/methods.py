@@ -22,7 +22,7 @@ def fit(
     backend: Backend = "loky",
     cluster: Cluster = {},  # noqa: B006 (tyro reads the default)
 ) -> None:
-    """Fit what methods know of a plant, for all suites of it that are here: beliefs, and calibrations on healthy flights.
+    """Fit what methods know of a plant, for all suites of it that are here: beliefs, calibrations, conformities.
 
     Args:
         plant: Plant or environment id; "module:id" where the module registers it.
@@ -48,7 +48,9 @@ def fit(
 
     plant_id = find_plant(plant)[1]
     entries = [
-        entry for entry in map(find_diagnoser, named(diagnosers)) if entry.takes("belief") or entry.takes("calibration")
+        entry
+        for entry in map(find_diagnoser, named(diagnosers))
+        if any(entry.takes(kind) for kind in ("belief", "calibration", "conformity"))
     ]
     asked = [suite for suite in map(load_suite, suites or suite_names()) if suite.plant == plant_id]
     if not entries or len(asked) < max(1, len(suites)):
@@ -66,7 +68,10 @@ def fit(
         if suites or diagnosers != ("all",):
             found = knowledge.merged(place, found)
         knowledge.write_fits(place, found)
-        print(f"{len(found.beliefs)} beliefs and {len(found.calibrations)} calibrations in {place}")
+        print(
+            f"{len(found.beliefs)} beliefs, {len(found.calibrations)} calibrations and {len(found.conformities)} "
+            f"conformities in {place}"
+        )
 
 
 def train(

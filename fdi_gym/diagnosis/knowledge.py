@@ -174,9 +174,7 @@ def merged(path: Path, found: Fits) -> Fits:
         return found
     if (old.plant, old.code) != (found.plant, found.code):
         return found
-    return msgspec.structs.replace(
-        found, beliefs={**old.beliefs, **found.beliefs}, calibrations={**old.calibrations, **found.calibrations}
-    )
+    return msgspec.structs.replace(found, **{kind: {**getattr(old, kind), **getattr(found, kind)} for kind in _KINDS})
 
 
 class Task(NamedTuple):
@@ -194,12 +192,15 @@ def tasks_of(entries: Sequence[Entry], suites: Sequence[Any]) -> dict[str, Task]
     for suite in suites:
         built = suite.build()
         for entry in entries:
-            if built.bare is not None and not entry.hears_sensors:
+            try:
+                plant, process = entry.told(built, suite.process)
+            except NotApplicableError:
+                continue
+            if plant is not built:
                 continue  # it knows what it knows of the plant without
             plant = built if built.regular is None else built.regular
             settings = entry.resolve(plant, **suite.settings.get(entry.name, {}))
-            key = calibration_key(entry, plant, suite.process, settings)
-            tasks[key] = Task(entry, plant, suite.process, settings)
+            tasks[calibration_key(entry, plant, process, settings)] = Task(entry, plant, process, settings)
     return tasks
 
 
@@ -214,13 +215,15 @@ def fit_suites(entries: Sequence[Entry], suites: Sequence[Any], jobs: int = -1) 
     wanted = {belief_key(t.plant, t.process): t for t in tasks.values() if t.entry.takes("belief")}
     made = in_order([joblib.delayed(_belief)(t.plant, t.process) for t in wanted.values()], jobs)
     beliefs: dict[str, Belief | None] = dict(zip(wanted, made, strict=True))
+    last = {kind: {k: t for k, t in tasks.items() if t.entry.takes(kind)} for kind in ("calibration", "conformity")}
     calls = [
         joblib.delayed(_calibration)(
             t.entry.name, *t[1:], beliefs[belief_key(t.plant, t.process)] if t.entry.takes("belief") else None
         )
-        for t in tasks.values() if t.entry.takes("calibration")
+        for t in last["calibration"].values()
     ]  # fmt: skip
-    found = dict(zip([k for k, t in tasks.items() if t.entry.takes("calibration")], in_order(calls, jobs), strict=True))
+    calls += [joblib.delayed(_conformity)(t.entry.name, *t[1:]) for t in last["conformity"].values()]
+    found = dict(zip([*last["calibration"], *last["conformity"]], in_order(calls, jobs), strict=True))
     files: dict[Path, Fits] = {}
     for key, task in tasks.items():
         home = package_of(task.entry)
@@ -229,8 +232,8 @@ def fit_suites(entries: Sequence[Entry], suites: Sequence[Any], jobs: int = -1) 
         believed = belief_key(task.plant, task.process)
         if task.entry.takes("belief") and (belief := beliefs[believed]) is not None:
             fits.beliefs[believed] = belief
-        if (calibration := found.get(key)) is not None:
-            fits.calibrations[key] = calibration
+        if (fit := found.get(key)) is not None:
+            (fits.conformities if isinstance(fit, Conformity) else fits.calibrations)[key] = fit
     return files
 
 
@@ -283,5 +286,12 @@ def _calibration(
         return None
     try:
         return fit_calibration(entry, plant, process, settings, belief)
+    except NotApplicableError:
+        return None
+
+
+def _conformity(name: str, plant: Plant, process: str, settings: Mapping[str, Any]) -> Conformity | None:
+    try:
+        return fit_conformity(find_diagnoser(name), plant, process, settings)
     except NotApplicableError:
         return None
