@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Iterable, Sequence
@@ -26,6 +25,7 @@ from fdi_gym.faults import (
     Sampling,
     Square,
 )
+from fdi_gym.names import unknown
 
 if TYPE_CHECKING:
     from fdi_gym.data_sheet import FaultMode, Signal
@@ -47,14 +47,6 @@ def is_real(value: Any) -> bool:
 def is_finite(value: Any) -> bool:
     """Whether a value is a finite number."""
     return is_real(value) and math.isfinite(value)
-
-
-def unknown(what: str, name: Any, known: Iterable[str], owner: str = "") -> str:
-    """The message for a name that does not exist: the nearest that does, and all of them."""
-    known = list(known)
-    near = difflib.get_close_matches(name, known, 1, 0.4) if isinstance(name, str) else []
-    guess = f"did you mean {near[0]!r}? " if near else ""
-    return f"unknown {what} {name!r}; {guess}{f'{owner} has' if owner else 'there are'} {', '.join(known) or 'none'}"
 
 
 def number(name: str, value: Any, low: float, high: float) -> float:
@@ -265,7 +257,7 @@ def check_sampling(plant: Plant, sampling: Sampling, steps: int) -> None:
     for field in ("periods", "delays"):
         for name, value in getattr(sampling, field).items():
             if name not in names:
-                raise ValueError(f"{field}: {unknown('sensor', name, names, plant.id)}")
+                raise ValueError(f"{field}: {unknown('sensor', name, names, f'{plant.id} has')}")
             if field == "delays" and value > steps:
                 raise ValueError(f"delays: the sensor {name} lags by at most the flight's {steps} samples, not {value}")
 

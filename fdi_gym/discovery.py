@@ -14,8 +14,8 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fdi_gym.checks import is_whole, unknown
-from fdi_gym.names import find_module
+from fdi_gym.checks import is_whole
+from fdi_gym.names import find_module, unknown
 from fdi_gym.options import split_options
 from fdi_gym.plant import Plant
 
@@ -103,7 +103,7 @@ def load_plant(plant_id: str, **options: Any) -> Plant:
         find_module(module)
     sources = plant_sources()
     if not isinstance(plant_id, str) or plant_id not in sources:
-        raise ValueError(unknown("plant", plant_id, sources))
+        raise unknown("plant", plant_id, sources)
     return Origin(plant_id, sources[plant_id], options).build()
 
 
@@ -122,8 +122,10 @@ def _built(plant_id: str, source: PlantSource, options: dict[str, Any]) -> Plant
     named = [n for n, p in parameters.items() if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
     if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
         for option in own:
+            if option not in named and option in layers.__struct_fields__:  # "feedback", in nobody's words
+                layers.check_feedback(own[option])
             if option not in named:
-                raise ValueError(unknown("option", option, [*named, *layers.__struct_fields__], plant_id))
+                raise unknown("option", option, [*named, *layers.__struct_fields__], f"{plant_id} has")
     try:
         plant = build(**own)
     except (ValueError, TypeError) as error:

@@ -15,12 +15,12 @@ _PLAIN = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9_.-]{0,78}[A-Za-z0-9_-])?", re.ASC
 _MODULE = re.compile(r"\w+(?:\.\w+)*", re.ASCII)
 
 
-def unknown(kind: str, name: str, known: Iterable[str]) -> ValueError:
-    """The error for a name that does not exist: the nearest one that does, and all of them."""
+def unknown(kind: str, name: Any, known: Iterable[str], owner: str = "there are") -> ValueError:
+    """The error for a name that does not exist: the nearest one that does, and all that `owner` ("B747Lateral has") does."""
     known = list(known)
-    near = difflib.get_close_matches(name, known, 1, 0.5)
+    near = difflib.get_close_matches(name, known, 1, 0.4) if isinstance(name, str) else []
     return ValueError(
-        f"unknown {kind} {name!r}; {f'did you mean {near[0]}? ' if near else ''}there are {', '.join(known) or 'none'}"
+        f"unknown {kind} {name!r}; {f'did you mean {near[0]}? ' if near else ''}{owner} {', '.join(known) or 'none'}"
     )
 
 

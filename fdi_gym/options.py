@@ -40,14 +40,19 @@ class Options(msgspec.Struct, kw_only=True, omit_defaults=True, forbid_unknown_f
     delays: dict[str, int] = {}
     hold: bool = False
 
+    @staticmethod
+    def check_feedback(value: Any) -> None:
+        """Raises ValueError for what is no feedback of sensors."""
+        if value not in FEEDBACK:
+            raise ValueError(f"unknown feedback {value!r}; there are {', '.join(FEEDBACK)}")
+
     def applied(self, plant: Plant) -> Plant:
         """The plant with them.
 
         Raises:
             ValueError: A value that is not allowed, or a sensor that the plant does not have.
         """
-        if self.feedback not in FEEDBACK:
-            raise ValueError(f"unknown feedback {self.feedback!r}; there are {', '.join(FEEDBACK)}")
+        self.check_feedback(self.feedback)
         fields = ("dropout", "burst", "periods", "delays", "hold")
         given = msgspec.to_builtins(self)
         sampling = msgspec.convert({name: getattr(self, name) for name in fields}, Sampling)

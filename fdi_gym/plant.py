@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 
 from fdi_gym.acting import Acting
-from fdi_gym.checks import check_declaration, check_scenario, twice, unknown
+from fdi_gym.checks import check_declaration, check_scenario, twice
 from fdi_gym.data_sheet import FaultMode, Kernels, Label, Signal, squared_error
 from fdi_gym.faults import FaultProcess, FaultScenario
 from fdi_gym.model import Array
 from fdi_gym.model import NotApplicableError as NotApplicableError
+from fdi_gym.names import unknown
 from fdi_gym.shapes import OPEN, Shapes
 from fdi_gym.truth import Truth
 
@@ -56,6 +57,11 @@ class _ByName:
         if "standard" in found and "fault-free" not in found:
             found = {**found, "fault-free": found["standard"].without_faults()}
         plant.__dict__["processes"] = found
+
+
+BROUGHT = {  # processes that an option of every plant brings (`fdi_gym.options`)
+    "mixed": "sensor_faults", "sensors": "sensor_faults", "unseen": "unseen", "simultaneous": "simultaneous",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -296,7 +302,9 @@ class Plant(Truth):
             ValueError: There is none of that name; the message lists those that exist.
         """
         if name not in self.processes:
-            raise ValueError(unknown("scenario", name, self.processes, self.id))
+            found = unknown("process", name, self.processes, f"{self.id} has")
+            option = BROUGHT.get(name)
+            raise ValueError(f"{found}; {name} comes with {option}=True") if option else found
         return self.processes[name]
 
     def describe(self) -> str:

@@ -222,7 +222,7 @@ def test_a_network_is_told_the_process_and_takes_an_unknown_one_for_the_first(ti
     )
     assert np.array_equal(first.label_probs, same.label_probs)
     assert not np.allclose(first.label_probs, other.label_probs)
-    with pytest.raises(ValueError, match="unknown scenario"):
+    with pytest.raises(ValueError, match="unknown process"):
         make_diagnoser("sequence_net", plant, path=str(tiny), process="no such")
 
 

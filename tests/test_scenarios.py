@@ -477,8 +477,8 @@ def test_a_flown_plant_in_spawned_environments(motor):
 
 
 @pytest.mark.parametrize(("plant_id", "options", "match"), [
-    ("B747Latreal", {}, "did you mean 'B747Lateral'"), ("b747", {}, "did you mean 'B747Lateral'"), (3, {}, "there are"),
-    ([], {}, "there are"), ("B747Lateral", {"varient": 1}, "did you mean 'variant'"),
+    ("B747Latreal", {}, "did you mean B747Lateral"), ("b747", {}, "did you mean B747Lateral"), (3, {}, "there are"),
+    ([], {}, "there are"), ("B747Lateral", {"varient": 1}, "did you mean variant"),
     ("B747Lateral", {"variant": 3}, "printed/open"), ("B747Lateral", {"labels": ["single"]}, "single, dual"),
     ("MissilePitch", {"noise_scale": "1"}, "noise_scale"), ("MissilePitch", {"noise_scale": NAN}, "noise_scale"),
     ("MissilePitch", {"fault_scale": 0}, "fault_scale"), ("MissilePitch", {"fault_scale": True}, "fault_scale"),

@@ -22,6 +22,7 @@ from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
 from fdi_gym.estimation.conformity import Conformity
 from fdi_gym.faults import draw
+from fdi_gym.plant import BROUGHT
 from fdi_gym.suite import Suite
 from fdi_gym.unseen import SOMETHING_ELSE, with_unseen
 
@@ -61,6 +62,14 @@ def test_what_knows_a_part_of_the_truth_does_not_know_this():
     plant = load_plant("B747Lateral", unseen=True)
     with pytest.raises(NotApplicableError, match="what told_onset_bank is told of the truth does not cover"):
         make_diagnoser("told_onset_bank", plant, process="unseen", scenarios=[draw(plant.process("unseen"), 0)])
+
+
+@pytest.mark.parametrize(("name", "option"), BROUGHT.items())
+def test_a_process_that_an_option_brings_is_found_by_its_name(b747, name, option):
+    with pytest.raises(ValueError, match=f"unknown process '{name}'.*{name} comes with {option}=True"):
+        gym.make("B747Lateral-Faults-v0", process=name)
+    assert name in load_plant("B747Lateral", **{option: True}).processes
+    assert name not in b747.processes
 
 
 def test_an_environment_has_the_answer():

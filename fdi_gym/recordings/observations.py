@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi_gym.checks import unknown
 from fdi_gym.engine import Record
 from fdi_gym.files import RefusedError
+from fdi_gym.names import unknown
 from fdi_gym.plant import Array, Plant
 from fdi_gym.recordings import clock
 from fdi_gym.recordings.columns import channel_columns
@@ -110,7 +110,7 @@ def _columns(plant: Plant, table: Table, mapping: Mapping) -> dict[str, Column]:
     channels = channel_columns(plant)
     for name in (*mapping.channels, *mapping.not_recorded):
         if name not in channels:
-            raise RefusedError(unknown("channel", name[:80], channels, plant.id))
+            raise RefusedError(str(unknown("channel", name[:80], channels, f"{plant.id} has")))
     found: dict[str, Column] = {}
     missing = []
     for name in channels:
@@ -120,7 +120,7 @@ def _columns(plant: Plant, table: Table, mapping: Mapping) -> dict[str, Column]:
         column = Column(given) if isinstance(given, str) else given
         if column.column not in table.units:
             if name in mapping.channels:
-                raise RefusedError(f"{table.source}: {unknown('column', column.column, table.units, 'it')}")
+                raise RefusedError(f"{table.source}: {unknown('column', column.column, table.units, 'it has')}")
             missing.append(name)
         found[name] = column
     if missing:
@@ -166,7 +166,7 @@ def _time(table: Table, mapping: Mapping) -> Time | None:
     if mapping.time is not None:
         time = Time(mapping.time) if isinstance(mapping.time, str) else mapping.time
         if time.column not in table.units:
-            raise RefusedError(f"{table.source}: {unknown('column', time.column, table.units, 'it')}")
+            raise RefusedError(f"{table.source}: {unknown('column', time.column, table.units, 'it has')}")
         return time
     found = [name for name in table.units if name.lower() in TIMES]
     return Time(found[0]) if found else None
@@ -198,7 +198,7 @@ def _truth_columns(table: Table, mapping: Mapping) -> list[str]:
     named = [label.column] if label else [c for c in (onset.column, onset.end, onset.fault) if c] if onset else []
     for name in named:
         if name not in table.units:
-            raise RefusedError(f"{table.source}: {unknown('column', name, table.units, 'it')}")
+            raise RefusedError(f"{table.source}: {unknown('column', name, table.units, 'it has')}")
     return named
 
 
@@ -281,4 +281,4 @@ def label_index(plant: Plant, word: str, names: dict[str, str], source: str) -> 
         number = np.nan
     if number in range(len(known)):
         return int(number)
-    raise RefusedError(f"{source}: {unknown('label', said[:80], known, plant.id)}, or their numbers from 0")
+    raise RefusedError(f"{source}: {unknown('label', said[:80], known, f'{plant.id} has')}, or their numbers from 0")
