@@ -94,7 +94,7 @@ def run(arguments: Arguments, suites: list[AnySuite], reasons: dict[str, dict[st
         for name in diagnosers():  # one after the other: each row is written as soon as it is there
             if name in reasons[suite.name] or row_path(arguments.results, suite.name, name).exists():
                 continue
-            command = f"fdi-gym evaluate {suite.name} --diagnosers {name}"
+            command = f"fdi-gym evaluate {suite.name} --diagnosers"
             found = evaluate(suite, [name], work=arguments.work, jobs=arguments.jobs, command=command)
             write_rows(arguments.results, suite, found)
     jobs: dict[str, Any] = {f"{s.name}.{name}": (consistency_piece, (s, name))

@@ -264,7 +264,7 @@ def evaluate(
         work: Folder of the finished blocks; a run that finds some there goes on from them.
         jobs: Worker processes, -1 for one per core; on a cluster calls at a time (`fdi_gym.clusters`).
         progress: Show a progress bar.
-        command: What to type to get these rows again.
+        command: What to type to get one of these rows again, before its name.
         block: Episodes flown and diagnosed together.
 
     Raises:
@@ -304,5 +304,5 @@ def _evaluated(
         metrics=summarise(outcomes, len(plant.labels), [s.name for s in plant.estimated], plant.dt),
     )  # fmt: skip
     time = 1e6 * sum(b.seconds for b in blocks) / sum(b.samples for b in blocks)
-    made = Made(command=command, versions=versions(), microseconds=round(time, 2))
+    made = Made(command=f"{command} {name}".strip(), versions=versions(), microseconds=round(time, 2))
     return Evaluated(row.sealed(), outcomes, made)

@@ -230,7 +230,7 @@ def test_all_suites_are_evaluated_by_one_command(capsys, two):
     assert said(capsys, *ALL, "--replace")[0] == 0
     assert rows_in(two / "r") == before
     made = json.loads((two / "r" / "other" / "made.json").read_text())
-    assert made["null"]["command"] == "fdi-gym evaluate other --diagnosers null random"
+    assert made["null"]["command"] == "fdi-gym evaluate other --diagnosers null"
 
 
 def test_a_killed_run_over_all_suites_goes_on_where_it_was(capsys, two, monkeypatch):

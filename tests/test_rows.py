@@ -442,7 +442,7 @@ def test_how_other_rows_were_made_is_kept(rows):
     write_rows(rows, frozen, evaluate(frozen, ["random"], work=rows.parent / "work", command="mine", **QUIET))
     made = row.read_made(rows / "small")
     assert set(made) == {*NAMES, "random"}
-    assert (made["random"].command, made["null"].command) == ("mine", "test")
+    assert (made["random"].command, made["null"].command) == ("mine random", "test null")
 
 
 def test_a_file_is_written_whole_or_not_at_all(tmp_path, monkeypatch):

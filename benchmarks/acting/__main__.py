@@ -40,8 +40,9 @@ def main() -> None:
         missing = [entrant for entrant in ENTRANTS[name] if not row_path(results, name, entrant).exists()]
         able, _ = applicable(suite, suite.build(), missing)
         for entrant in able:
-            command = f"fdi-gym evaluate {name} --diagnosers {entrant}"
-            found = evaluate(suite, [entrant], work=Path("runs"), jobs=arguments.jobs, command=command)
+            found = evaluate(
+                suite, [entrant], work=Path("runs"), jobs=arguments.jobs, command=f"fdi-gym evaluate {name} --diagnosers"
+            )
             write_rows(results, suite, found)
 
 

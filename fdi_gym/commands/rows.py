@@ -76,9 +76,8 @@ def evaluate(
     lines, every, times = [], [], {}
     for said, suite, plant, names in asked:
         begun = time.monotonic()
-        command = f"fdi-gym evaluate {said} --diagnosers {' '.join(names)}"
         with on(backend, cluster, work):
-            found = evaluation.evaluate(suite, names, work=work, jobs=jobs, command=command)
+            found = evaluation.evaluate(suite, names, work=work, jobs=jobs, command=f"fdi-gym evaluate {said} --diagnosers")
         rows = [f.row for f in found.values()]
         mine = {name: f.made.microseconds for name, f in found.items()}
         board = leaderboard.Board(suite, plant, rows, {name: f.outcomes for name, f in found.items()}, mine)
