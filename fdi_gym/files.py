@@ -76,6 +76,20 @@ def read_json(path: Path, kind: type[T], what: str, limit: int = LIMIT) -> T:
     return decode(read_bytes(path, limit), kind, f"{path} is not a {what}")
 
 
+def make_room(path: Path) -> None:
+    """Make the folder that a file will go into, before anything is computed for it.
+
+    Raises:
+        OSError: It cannot be made, or there is a folder where the file would be.
+    """
+    if path.is_dir():
+        raise OSError(errno.EISDIR, f"cannot write {path}: it is a folder")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(error.errno, f"cannot write {path}: {os.strerror(error.errno or 0)}") from error
+
+
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file so that it is either there whole or not there.
 

@@ -417,3 +417,28 @@ def test_rows_that_would_be_lost_are_named(capsys, here, small):
     path.write_text(json.dumps(content))
     assert "is not written as rows are" in refused(capsys, *evaluated)
     assert json.loads(path.read_text()) == content
+
+
+@pytest.mark.parametrize("words", [
+    ("evaluate", "b747-standard", "--diagnosers", "null", "--csv"), ("plot", "severity", "b747-standard", "--output"),
+    ("report", "b747-standard", "--output"), ("diagnosability", "B747Lateral", "--picture"), ("leaderboard", "--pages"),
+], ids=lambda words: words[0])  # fmt: skip
+def test_a_place_that_cannot_be_is_refused_before_anything_is_computed(capsys, monkeypatch, tmp_path, words):
+    from fdi_gym import diagnosability, evaluation, leaderboard, pictures, report
+
+    for module, name in ((evaluation, "evaluate"), (pictures, "picture"), (report, "report"), (leaderboard, "render"),
+                         (diagnosability, "diagnosability")):  # fmt: skip
+        monkeypatch.setattr(module, name, None)
+    (tmp_path / "file").write_text("")
+    assert "cannot write" in refused(capsys, *words, str(tmp_path / "file" / "made.png"))
+    if words[0] != "leaderboard":
+        (tmp_path / "folder.png").mkdir()
+        assert "it is a folder" in refused(capsys, *words, str(tmp_path / "folder.png"))
+
+
+def test_folders_of_what_is_made_are_made(capsys, tmp_path):
+    place = tmp_path / "not" / "there" / "severity.svg"
+    cli.main(
+        ["plot", "severity", "b747-standard", "--output", str(place), "--results", str(ROOT / "leaderboards" / "results")]
+    )
+    assert place.stat().st_size > 1000

@@ -130,10 +130,13 @@ def diagnosability(
     """
     from fdi_gym.diagnosability import diagnosability as measure
     from fdi_gym.discovery import load_plant
+    from fdi_gym.files import make_room
     from fdi_gym.listing import find_plant
 
     if picture is not None and picture.suffix not in (".png", ".pdf", ".svg"):
         raise ValueError(f"a picture is a .png, .pdf or .svg file, not {picture.name}")
+    if picture is not None:
+        make_room(picture)
     found = measure(load_plant(find_plant(plant)[1]), process, flights=flights, seconds=seconds)
     print(found.text())
     if picture is not None:

@@ -28,8 +28,9 @@ def leaderboard(
         suites: Paths of suites, or "module:name", that are not installed.
     """
     from fdi_gym import leaderboard
-    from fdi_gym.files import write_whole
+    from fdi_gym.files import make_room, write_whole
 
+    make_room(pages / "README.md")
     for name, text in leaderboard.render(results, suites).items():
         write_whole(pages / name, text.encode())
         print(pages / name)
@@ -53,11 +54,12 @@ def report(
         methods: Who is shown the flights to look at; "all" for everyone with a row. Default: the best four, and a ceiling.
         flights: How many flights to look at.
     """
-    from fdi_gym.files import write_whole
+    from fdi_gym.files import make_room, write_whole
     from fdi_gym.leaderboard import read_board
     from fdi_gym.report import report as make
     from fdi_gym.suite import load_suite
 
+    make_room(output)
     frozen = load_suite(suite)
     page = make(read_board(results / frozen.name, {frozen.name: frozen}), methods, flights, sys.stderr.isatty()).encode()
     write_whole(output, page)
@@ -88,10 +90,12 @@ def plot(
         sensors: Show what the sensors say, too.
         results: Folder of the rows.
     """
+    from fdi_gym.files import make_room
     from fdi_gym.pictures import picture
     from fdi_gym.suite import load_suite
 
     output = Path(f"{kind}.png") if output is None else output
+    make_room(output)
     figure = picture(kind, load_suite(suite), methods, results, flight=flight, sensors=sensors)
     if output.suffix[1:] not in figure.canvas.get_supported_filetypes():
         raise ValueError(f"a picture is png, svg or pdf, not {output.suffix or output.name!r}")

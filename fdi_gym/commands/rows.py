@@ -61,7 +61,7 @@ def evaluate(
     """
     from fdi_gym import evaluation, leaderboard, row, tables
     from fdi_gym.clusters import on
-    from fdi_gym.files import write_whole
+    from fdi_gym.files import make_room, write_whole
     from fdi_gym.names import unknown
 
     for column in columns:
@@ -69,6 +69,8 @@ def evaluate(
             raise unknown("column", column, tables.COLUMNS)
     if episodes is not None and results is not None:
         raise ValueError("rows are made of the whole suite: --results and --episodes don't go together")
+    if csv is not None:
+        make_room(csv)
     asked = _asked(suites, diagnosers, episodes)
     if results is not None:
         for _, suite, plant, names in asked:
