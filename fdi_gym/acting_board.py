@@ -14,6 +14,7 @@ from fdi_gym.intervals import mean_interval
 from fdi_gym.row import Row
 from fdi_gym.tables import FLOOR, clairvoyant, knows, markdown, plain, told
 
+UNSEEING = ("false_alarm", *FLOOR)  # diagnosers that look at nothing: by chance one is right soon, and not for long
 WORSE = 1.05  # a flight is worse where it costs more than so many times what it costs with nothing
 
 PROBING = """An entrant is a diagnoser that never probes, or a prober with `{on_board}` on board that chooses a probe every
@@ -114,7 +115,7 @@ def verdict(acted: Acted) -> str:
     if chosen is None or passive is None:
         return ""
     drawn, name = acted.drawn(), chosen.diagnoser
-    others = [r.diagnoser for r in acted.rows if family(r) == NEVER and not clairvoyant(r)]
+    others = [r.diagnoser for r in acted.rows if family(r) == NEVER and not clairvoyant(r) and r.diagnoser not in UNSEEING]
     gain = drawn.difference(name, passive.diagnoser)
     far = horizon(acted.outcomes[name])
     mine = delays(acted.outcomes[name], far, acted.plant.dt)
@@ -126,7 +127,7 @@ def verdict(acted: Acted) -> str:
     words = (
         f"The best chosen probing, `{name}`, has {said(gain, 1, 100.0)} points of accuracy per sample more than the best "
         f"that never probes, and isolates {when}, at a cost of {said(added)}: it "
-        f"{'beats every entrant that never probes' if sure else 'does not beat every entrant that never probes'} in both."
+        f"{'beats' if sure else 'does not beat'} every diagnoser that looks and never probes in both."
     )
     oracle = acted.passive(told=True)
     if oracle is not None:
@@ -221,7 +222,7 @@ def in_a_line(acted: Acted) -> str:
         if chosen is None or passive is None:
             return "-"
         return f"{plain(chosen.diagnoser)} {100 * accuracy(chosen):.1f}, passive {100 * accuracy(passive):.1f}"
-    own = [r for r in acted.rows if not clairvoyant(r) and r.diagnoser not in (TRUTH.name, "false_alarm", *FLOOR)]
+    own = [r for r in acted.rows if not clairvoyant(r) and r.diagnoser not in (TRUTH.name, *UNSEEING)]
     best = min(own, key=lambda row: row.metrics["acting"]["cost"], default=None)
     share = None if best is None else shares(acted, best.diagnoser)
     if best is None or share is None:
