@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from fdi_gym.discovery import load_plant
 from fdi_gym.engine import Record, simulate
 from fdi_gym.faults import draw
 from fdi_gym.metrics import scored_samples
-from fdi_gym.plant import Array, Plant
+from fdi_gym.plant import Array, NotApplicableError, Plant
 from fdi_gym.scores import balanced_accuracy
 
 # the first seed of each split, which ends where the next begins
@@ -23,10 +24,11 @@ PER_SEED = 1_000_000  # training seeds that belong to one seed of a run
 
 
 class Condition(NamedTuple):
-    """A fault process to train on, and the plant's options with it."""
+    """A fault process to train on, the plant's options with it, and how far the plant's parameters may be off."""
 
     process: str
     options: dict[str, float]
+    mismatch: float = 0.0
 
 
 class Flights(NamedTuple):
@@ -46,9 +48,18 @@ def plant_under(plant: Plant, condition: Condition) -> Plant:
 
 
 def fly(plant: Plant, condition: Condition, seeds: Sequence[int]) -> Record:
-    """The flights of `reset(seed)` for these seeds."""
+    """The flights of `reset(seed)` for these seeds; off the model each is of another plant.
+
+    Raises:
+        NotApplicableError: The plant has no mismatch, and the condition has.
+    """
     process = plant.process(condition.process)
-    return simulate(plant, [draw(process, seed) for seed in seeds])
+    if not condition.mismatch:
+        return simulate(plant, [draw(process, seed) for seed in seeds])
+    if plant.perturb is None:
+        raise NotApplicableError(f"{plant.id} has no mismatch")
+    perturb = functools.partial(plant.perturb, level=condition.mismatch)
+    return simulate(plant, [draw(process, seed, perturb) for seed in seeds])
 
 
 def identified(plants: Sequence[Plant], shape: FeatureShape, records: Sequence[Record]) -> FeatureModel:

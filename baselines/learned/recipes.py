@@ -100,6 +100,7 @@ class PolicyRecipe(LegsRecipe):
     entropy: float = 0.01
 
 
+MISMATCH = 0.1  # of the plants that a network is trained on that is to bear it: that of the suites
 BOTH = (Condition("standard", {}), Condition("hard", {}))
 SEQUENCES = {
     "B747Lateral": SequenceRecipe(
@@ -149,6 +150,12 @@ def sequence_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
     if plant.bare is not None:  # sensors may fail too: the one process that shows all labels
         found = replace(found, conditions=(Condition("mixed", found.conditions[0].options),))
     return found if budget is None else replace(found, flights=budget, chunk=min(found.chunk, budget))
+
+
+def randomised_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
+    """The recipe of the network that is trained on plants off the model; arguments as in `sequence_recipe`."""
+    found = sequence_recipe(plant, budget)
+    return replace(found, conditions=tuple(c._replace(mismatch=MISMATCH) for c in found.conditions))
 
 
 def residual_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:

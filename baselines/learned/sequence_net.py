@@ -21,22 +21,24 @@ from baselines.learned import features as feat
 from baselines.learned import weights
 from baselines.learned.flights import filter_features
 from baselines.learned.probabilities import log_softmax
-from baselines.learned.recipes import residual_recipe, sequence_recipe
+from baselines.learned.recipes import randomised_recipe, residual_recipe, sequence_recipe
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser, diagnosers, make_diagnoser, trainer
 from fdi_gym.plant import Array, Plant
 
+RECIPES = {"sequence_net": sequence_recipe, "residual_net": residual_recipe, "randomised_net": randomised_recipe}
 REACH = 10.0  # trust in filters is learned so many times faster than the rest: it must rise and fall by several logits
 LOG_STD = (-6.0, 3.0)  # bounds of the estimate's log standard deviation
 
 
 @diagnoser("sequence_net", "Recurrent network on observations, supervised", sensors=True, method="sequence_net")
 @diagnoser("residual_net", "Recurrent network that is shown filters too, supervised", sensors=True, method="residual_net")
+@diagnoser("randomised_net", "Recurrent network trained on plants off the model", sensors=True, method="randomised_net")
 def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "standard", path: str = "") -> Diagnoser:
     """The trained network.
 
     Args:
         plant: A plant that there are weights for.
-        method: Which network: "sequence_net" or "residual_net".
+        method: Which network: "sequence_net", "residual_net" or "randomised_net".
         process: The fault process that it is told to expect.
         path: Weights of your own; their card lies beside them.
 
@@ -90,6 +92,7 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
 
 @trainer("sequence_net", "Recurrent network on observations, supervised")
 @trainer("residual_net", "The network that is shown filters too; starts from sequence_net", method="residual_net")
+@trainer("randomised_net", "The network on plants off the model, each flight another", method="randomised_net")
 def train_sequence_net(
     plant: Plant, *, budget: int | None = None, seed: int = 0, work: Path = Path("runs"), threads: int = 1,
     method: str = "sequence_net",
@@ -103,14 +106,15 @@ def train_sequence_net(
         work: Folder of runs; one that was killed goes on. "residual_net" starts from the weights of "sequence_net" there,
             or else from those that ship.
         threads: Of torch.
-        method: "sequence_net" or "residual_net".
+        method: "sequence_net", "residual_net" or "randomised_net".
 
     Raises:
+        NotApplicableError: The plant has no mismatch, and randomised_net needs it.
         ValueError: There is no network to start from, or the folder holds another run.
     """
     from baselines.learned._supervised import SupervisedTraining
 
-    recipe = (residual_recipe if method == "residual_net" else sequence_recipe)(plant, budget)
+    recipe = RECIPES[method](plant, budget)
     name = weights.stem("sequence_net", plant)
     file = f"{name}.safetensors"
     own = work / f"{name}-{seed}" / file

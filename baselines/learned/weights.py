@@ -66,6 +66,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         task: "isolation", "identification" or "both".
         shape: What the network is made of.
         filters: The diagnosers that it is shown.
+        mismatch: How far the plants were off the model that it was trained on.
         seeds: First and last seed of the training, validation and calibration flights.
         budget: What was used: flights, samples, steps, seconds.
         curve: The training curve: one entry per validation.
@@ -91,6 +92,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     task: str
     shape: dict[str, Any]
     filters: list[str] = []
+    mismatch: float = 0.0
     seeds: dict[str, list[int]]
     budget: dict[str, float]
     curve: list[dict[str, Any]]
