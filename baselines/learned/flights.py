@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -56,10 +55,10 @@ def fly(plant: Plant, condition: Condition, seeds: Sequence[int]) -> Record:
     process = plant.process(condition.process)
     if not condition.mismatch:
         return simulate(plant, [draw(process, seed) for seed in seeds])
-    if plant.perturb is None:
+    drawn = plant.perturb
+    if drawn is None:
         raise NotApplicableError(f"{plant.id} has no mismatch")
-    perturb = functools.partial(plant.perturb, level=condition.mismatch)
-    return simulate(plant, [draw(process, seed, perturb) for seed in seeds])
+    return simulate(plant, [draw(process, seed, lambda rng: drawn(rng, condition.mismatch)) for seed in seeds])
 
 
 def identified(plants: Sequence[Plant], shape: FeatureShape, records: Sequence[Record]) -> FeatureModel:
