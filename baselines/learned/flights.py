@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -58,7 +58,11 @@ def fly(plant: Plant, condition: Condition, seeds: Sequence[int]) -> Record:
     drawn = plant.perturb
     if drawn is None:
         raise NotApplicableError(f"{plant.id} has no mismatch")
-    return simulate(plant, [draw(process, seed, lambda rng: drawn(rng, condition.mismatch)) for seed in seeds])
+
+    def perturb(rng: np.random.Generator) -> Mapping[str, Any]:
+        return drawn(rng, condition.mismatch)
+
+    return simulate(plant, [draw(process, seed, perturb) for seed in seeds])
 
 
 def identified(plants: Sequence[Plant], shape: FeatureShape, records: Sequence[Record]) -> FeatureModel:
