@@ -12,6 +12,7 @@ from typing import Any
 
 from baselines.learned import weights
 from baselines.learned.weights import Card
+from fdi_gym.diagnosis import diagnosers
 from fdi_gym.files import write_whole
 from fdi_gym.leaderboard import read_rows
 from fdi_gym.plots import panels
@@ -20,7 +21,7 @@ from fdi_gym.suite import suite_names
 from fdi_gym.tables import clairvoyant, markdown
 
 HOME = Path(__file__).parent.parent / "leaderboards"
-LEARNED = ("sequence_net", "residual_net", "ppo", "ppo_identification")
+LEARNED = tuple(name for name, entry in diagnosers().items() if entry.build.__module__.startswith("baselines.learned."))
 REFERENCE = ("bayes_bank", "switching_bayes_bank", "hypothesis_bank")  # this package's own Bayesian banks, of no paper
 FLOOR = ("null", "random")
 
@@ -96,7 +97,9 @@ def calibration_table(cards: list[Card]) -> str:
 
 def cost_table(cards: list[Card]) -> str:
     """What the policies cost beside supervision: samples and time until the same validated accuracy."""
-    supervised = {card.plant: card for card in cards if card.method == "sequence_net"}
+    supervised = {
+        card.plant: card for card in cards if (card.method, "standard" in card.processes) == ("sequence_net", True)
+    }
     lines = []
     for card in cards:
         if card.method != "ppo" or card.plant not in supervised:
@@ -148,6 +151,11 @@ def budget_table(cards: list[Card]) -> str:
     return markdown(["command", "samples", "minutes", "training seeds", "filters"], lines)
 
 
+def title(card: Card) -> str:
+    """What weights are called: their file's name without suffix."""
+    return f"{card.method}-{card.plant}" + ("-sensors" if any(o.get("sensor_faults") for o in card.options) else "")
+
+
 def picture(card: Card, path: Path) -> None:
     """The learning curve: validated score over training time."""
     figure = panels.new_figure(6, 3.4)
@@ -160,7 +168,7 @@ def picture(card: Card, path: Path) -> None:
         handles.append(panels.drawn(axes, minutes, shown, i, label=name, marker=".", markersize=4))
     score = "balanced accuracy [%]" if card.task != "identification" else "scaled RMSE"
     axes.set(xlabel="training [min], one core of a shared machine", ylabel=f"{score}, validation flights")
-    axes.set_title(f"{card.method}, {card.plant}", fontsize=10)
+    axes.set_title(title(card), fontsize=10)
     panels.plain(axes)
     panels.legend(figure, handles, ncol=2)
     axes.grid(alpha=0.3)
@@ -173,7 +181,7 @@ def page(cards: list[Card]) -> str:
     parts = {
         "accuracy": accuracy_table(), "calibration": calibration_table(cards), "cost": cost_table(cards),
         "identification": identification_table(), "budget": budget_table(cards),
-        "curves": "\n".join(f"![{c.method}, {c.plant}]({c.method}-{c.plant}.png)" for c in cards),
+        "curves": "\n".join(f"![{title(c)}]({title(c)}.png)" for c in cards),
     }  # fmt: skip
     for name, part in parts.items():
         text = text.replace(f"{{{{{name}}}}}", part)
@@ -185,7 +193,7 @@ def main() -> None:
     cards = [weights.read_card(path) for path in sorted(weights.WEIGHTS.glob("*.safetensors"))]
     cards = [card for card in cards if "accuracy" in card.curve[-1]]  # of what is trained round by round
     for card in cards:
-        picture(card, HOME / "learning" / f"{card.method}-{card.plant}.png")
+        picture(card, HOME / "learning" / f"{title(card)}.png")
     write_whole(HOME / "learning" / "README.md", page(cards).encode())
     print(HOME / "learning" / "README.md")
 

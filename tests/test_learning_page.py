@@ -22,8 +22,9 @@ def cards():
 
 def test_page_is_what_the_report_writes():
     assert (ROOT / "leaderboards/learning/README.md").read_text() == learning_page.page(cards())
+    assert {learning_page.title(card) for card in cards()} <= {path.stem for path in weights.WEIGHTS.glob("*.safetensors")}
     for card in cards():
-        assert (ROOT / "leaderboards/learning" / f"{card.method}-{card.plant}.png").exists()
+        assert (ROOT / "leaderboards/learning" / f"{learning_page.title(card)}.png").exists()
 
 
 def test_rows_that_are_made_appear_on_the_page(tmp_path, monkeypatch):
