@@ -6,10 +6,11 @@ In so many samples they can be told apart by the Kullback-Leibler divergence
     D_ij = sum_k |nu_i,k - nu_j,k|^2_{S^-1} / 2
 
 which is measured on flights without noise, of faults drawn from the process. An error between i and j, of which one is
-true with the believed probabilities p_i and p_j, is resolved with the probability 1 - exp(-D_ij).
+true with the believed probabilities p_i and p_j, is resolved with the probability 1 - exp(-D_ij), for two labels the mean
+over their faults: large ones that anybody sees say nothing of small ones that only a probe shows.
 
 What is believed is what the diagnoser says, and doubt: at every decision a fault may have begun that has not been seen,
-and what has been probed since is known better, by the same 1 - exp(-D_ij).
+and what has been probed since is known better, by the same probability.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from fdi_gym.flights import Flights
 from fdi_gym.plant import Array, Plant
 
 SEEDS = range(2_000_000, 2_002_000)  # of the faults that the hypotheses stand for
-EXAMPLES, BASES = 3, 3  # faults of each label, flights that they are put on
+EXAMPLES, BASES = 8, 3  # faults of each label, flights that they are put on
 
 
 class Doubt:
@@ -44,8 +45,7 @@ class Doubt:
     """
 
     def __init__(self, plant: Plant, process: str, period: int, window: int = 400):
-        apart = 1.0 - np.exp(-divergences(plant, process, window) * period / window)
-        self.apart = apart.mean(axis=0)  # (probes, labels, labels) probability that a decision under a probe resolves them
+        self.apart = resolved(plant, process, window, period)
         self.labels, self.hazard = len(plant.labels), _hazard(plant, process, period)
 
     def begin(self, n: int) -> Array:
@@ -78,10 +78,11 @@ def _hazard(plant: Plant, process: str, period: int) -> float:
 
 
 @functools.lru_cache(maxsize=8)
-def divergences(plant: Plant, process: str, window: int) -> Array:
-    """D (bases, probes, labels, labels) over so many samples from when the faults begin, as late as they do in the process.
+def resolved(plant: Plant, process: str, window: int, period: int) -> Array:
+    """The probability (probes, labels, labels) that a decision under a probe resolves an error between two labels.
 
-    Bases are flights without a fault, on which faults of each label are put; of two labels the mean over their faults.
+    Of D over `window` samples from when the faults begin, as late as they do in the process, a decision has its share. Bases
+    are flights without a fault, on which faults of each label are put; it is the mean over these and over the faults.
     """
     faults, label, onset = examples(plant, process)
     filtered = steady(plant)
@@ -104,9 +105,9 @@ def divergences(plant: Plant, process: str, window: int) -> Array:
             D = 0.5 * ((nu[:, :, None] - nu[:, None]) ** 2).sum(axis=(0, 3))
             apart = np.zeros((len(plant.labels), len(plant.labels)))
             for i, j in itertools.permutations(np.unique(label), 2):
-                apart[i, j] = np.nan_to_num(D[np.ix_(label == i, label == j)]).mean()
+                apart[i, j] = -np.expm1(-np.nan_to_num(D[np.ix_(label == i, label == j)]) * period / window).mean()
             found[-1].append(apart)
-    return np.array(found)
+    return np.array(found).mean(axis=0)
 
 
 def examples(plant: Plant, process: str) -> tuple[list[Any], Array, int]:
