@@ -444,7 +444,7 @@ def test_in_level_flight_a_weak_surface_is_told_from_none_by_its_probe_alone():
 
 
 def test_a_probe_is_worth_what_it_shows_of_faults_that_nobody_sees_without():
-    """In quiet hover most losses are seen at once, weak ones of the longitudinal cyclic are not, and its probe shows them."""
+    """In quiet hover most losses are seen at once, weak ones of the longitudinal cyclic are not; its probe shows them."""
     plant = load_plant("HUAVHover")
     found, lon = doubt.resolved(plant, "quiet", 400, 25), [label.name for label in plant.labels].index("lon")
     cyclic = [p.name for p in plant.acting.probes].index("cyclic")
