@@ -83,7 +83,7 @@ WRONG = [
     (("verify", "."), "is no file"), (("verify", "x.json", "--share", "2"), "share is above 0 and up to 1"),
     (("verify", "x.json", "--share", "0"), "share is above 0 and up to 1"),
     (("verify", "x.json", "--seed", "-1"), "seed is 0 or more"),
-    (("leaderboard", "--results", "nowhere", "--pages", "nowhere"), "cannot write nowhere/README.md"),
+    (("leaderboard", "--results", "nowhere", "--pages", "nowhere"), "nowhere is no folder of rows"),
     (("evaluate", "b747-paper", "--diagnosers", "null", "--columns", "smple"), "did you mean sample?"),
     (("evaluate", "b747-paper", "--diagnosers", "null", "--episodes", "0"), "has from 1 to 30 flights, not 0"),
     (("list", "B747Latera"), "did you mean B747Lateral"), (("list", "b747-papr"), "did you mean b747-paper"),
@@ -394,6 +394,7 @@ def test_an_interruption_is_one_line_and_status_130(tmp_path, small):
         [*FDI_GYM, "evaluate", "b747-standard", "--diagnosers", "random", "switching_bayes_bank", "--jobs", "2",
          "--work", str(tmp_path)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True, cwd=tmp_path,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background ignores it
     )  # fmt: skip
     for _ in range(1200):
         if list(tmp_path.rglob("block-*.json")) or run.poll() is not None:
@@ -421,7 +422,8 @@ def test_rows_that_would_be_lost_are_named(capsys, here, small):
 
 @pytest.mark.parametrize("words", [
     ("evaluate", "b747-standard", "--diagnosers", "null", "--csv"), ("plot", "severity", "b747-standard", "--output"),
-    ("report", "b747-standard", "--output"), ("diagnosability", "B747Lateral", "--picture"), ("leaderboard", "--pages"),
+    ("report", "b747-standard", "--output"), ("diagnosability", "B747Lateral", "--picture"),
+    ("leaderboard", "--results", str(ROOT / "leaderboards" / "results"), "--pages"),
 ], ids=lambda words: words[0])  # fmt: skip
 def test_a_place_that_cannot_be_is_refused_before_anything_is_computed(capsys, monkeypatch, tmp_path, words):
     from fdi_gym import diagnosability, evaluation, leaderboard, pictures, report

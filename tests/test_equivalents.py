@@ -113,6 +113,7 @@ def built(plant):
     }  # fmt: skip
     for name, entry in diagnosers().items():
         try:
+            entry.told(plant, "standard")
             diagnoser = entry.build(plant, **{k: v for k, v in given.items() if entry.takes(k)}, **entry.resolve(plant))
         except ValueError:  # it does not suit this plant
             continue

@@ -30,6 +30,8 @@ def leaderboard(
     from fdi_gym import leaderboard
     from fdi_gym.files import make_room, write_whole
 
+    if not results.is_dir():
+        raise ValueError(f"{results} is no folder of rows")
     make_room(pages / "README.md")
     for name, text in leaderboard.render(results, suites).items():
         write_whole(pages / name, text.encode())
