@@ -17,8 +17,6 @@ from fdi_gym.evaluation import evaluate
 from fdi_gym.files import RefusedError
 from fdi_gym.suite import Suite, freeze, load_suite
 
-pytestmark = pytest.mark.xdist_group("clusters")  # what they share is made once
-
 # before Ray is imported: all of its nodes are on the loopback, and it tells nobody that it is used
 os.environ |= {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_USAGE_STATS_ENABLED": "0"}
 METHODS = """

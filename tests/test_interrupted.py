@@ -13,8 +13,6 @@ import pytest
 
 from fdi_gym.suite import Suite, freeze
 
-pytestmark = pytest.mark.xdist_group("interrupted")  # what they share is made once
-
 METHODS = ("null", "random", "two_stage_kf")
 SCRIPT = """
 import sys

@@ -14,8 +14,6 @@ from test_cli import refused
 import fdi_gym
 from fdi_gym import discovery, scaffold
 
-pytestmark = pytest.mark.xdist_group("packages")  # what they share is made once
-
 
 def installed(folder, place):
     """The package of a folder as a wheel would put it: its modules, and its entry points beside them."""

@@ -14,8 +14,6 @@ from fdi_gym.design import truths
 from fdi_gym.diagnosis import diagnosers
 from fdi_gym.suite import load_suite, suite_names
 
-pytestmark = pytest.mark.xdist_group("site")  # what they share is made once
-
 pytest.importorskip("mkdocstrings", reason="pip install 'fdi-gym[docs]'")
 pytest.importorskip("material", reason="pip install 'fdi-gym[docs]'")
 PAGES = ROOT / "docs" / "pages"
