@@ -97,9 +97,7 @@ def calibration_table(cards: list[Card]) -> str:
 
 def cost_table(cards: list[Card]) -> str:
     """What the policies cost beside supervision: samples and time until the same validated accuracy."""
-    supervised = {
-        card.plant: card for card in cards if (card.method, "standard" in card.processes) == ("sequence_net", True)
-    }
+    supervised = {card.plant: card for card in cards if card.method == "sequence_net" and "standard" in card.processes}
     lines = []
     for card in cards:
         if card.method != "ppo" or card.plant not in supervised:

@@ -89,6 +89,12 @@ def sections_of(page):
     return {name: text.strip() for name, text in (part.split("\n", 1) for part in parts)}
 
 
+def write_sections(page, introduction, sections):
+    """The page: what it is about, and a section for each plant."""
+    parts = [introduction, *(f"\n## {name}\n\n{text}" for name, text in sorted(sections.items()))]
+    page.write_text("\n".join(parts).rstrip() + "\n")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("plants", nargs="*", default=list(plant_sources()))
@@ -106,8 +112,7 @@ def main():
         table = markdown(head, sorted(rows, key=lambda row: arguments.methods.index(row[0])))
         sections[plant_id] = f"{arguments.flights} flights a row.\n\n{table}"
         if arguments.page:
-            parts = [INTRODUCTION, *(f"\n## {name}\n\n{text}" for name, text in sorted(sections.items()))]
-            arguments.page.write_text("\n".join(parts).rstrip() + "\n")
+            write_sections(arguments.page, INTRODUCTION, sections)
 
 
 if __name__ == "__main__":

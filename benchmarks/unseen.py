@@ -14,8 +14,8 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[name] = "1"
 
 import numpy as np
-from scipy.stats import binomtest, mannwhitneyu
-from sensors import sections_of
+from scipy.stats import mannwhitneyu
+from sensors import sections_of, share, write_sections
 
 from fdi_gym.diagnosis import NotApplicableError, diagnosers, make_diagnoser
 from fdi_gym.diagnosis.conforming import decided, of_each_label
@@ -38,12 +38,6 @@ flight. "Off the model" are the same known flights on a plant whose parameters a
 nothing is promised. AUROC is the probability that an unseen flight looks less like anything known than a known one does.
 Percent with 95 % intervals (Clopper and Pearson), AUROC with one of resampled flights.
 """
-
-
-def share(hits):
-    """A share in percent with its interval."""
-    low, high = binomtest(int(hits.sum()), hits.size).proportion_ci(0.95)
-    return f"{100 * hits.mean():.0f} ({100 * low:.0f}-{100 * high:.0f})"
 
 
 def area(unseen, known):
@@ -102,8 +96,7 @@ def main():
         said = f"{n} known flights of each label, where so many are met, {2 * n} unseen ones; off the model by {level:g} %."
         sections[plant_id] = f"{said}\n\n{markdown(HEAD, rows)}"
         if arguments.page:
-            parts = [INTRODUCTION, *(f"\n## {name}\n\n{text}" for name, text in sorted(sections.items()))]
-            arguments.page.write_text("\n".join(parts).rstrip() + "\n")
+            write_sections(arguments.page, INTRODUCTION, sections)
 
 
 if __name__ == "__main__":

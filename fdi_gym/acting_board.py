@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from fdi_gym.acted import NEVER, Acted, accuracy, at_this_cost, delays, family, horizon, shares, truths
+from fdi_gym.comparison import Drawn
 from fdi_gym.entrants import NOTHING, TRUTH, fly_entrant
 from fdi_gym.intervals import mean_interval
 from fdi_gym.row import Row
@@ -41,9 +42,9 @@ def said(value: Sequence[float] | None, digits: int = 3, factor: float = 1.0) ->
     return f"{middle:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
-def probing_table(acted: Acted, width: int | None = None) -> str:
-    """Who enters a suite of probing, best accuracy first."""
-    passive, drawn, lines = acted.passive(), acted.drawn(), []
+def probing_table(acted: Acted, drawn: Drawn, width: int | None = None) -> str:
+    """Who enters a suite of probing, best accuracy first, and what those know that are told of the truth."""
+    passive, lines = acted.passive(), []
     for row in sorted(acted.rows, key=lambda row: (-accuracy(row), row.diagnoser)):
         name, m = row.diagnoser, row.metrics
         gain = late = added = None
@@ -65,7 +66,7 @@ def probing_table(acted: Acted, width: int | None = None) -> str:
         ])  # fmt: skip
     head = ["entrant", "per sample %", "per decision %", "more than the best passive", "isolated after s",
             "later than the best passive s", "added cost", "more at this cost", "probed %", "false alarms/h"]  # fmt: skip
-    return markdown(head, lines, width)
+    return "\n\n".join(part for part in (markdown(head, lines, width), told(acted.rows)) if part)
 
 
 def accommodation_table(acted: Acted, width: int | None = None) -> str:
@@ -109,12 +110,12 @@ def by_fault_table(acted: Acted, width: int | None = None) -> str:
     return markdown(["fault", "flights", *map(plain, names)], lines, width)
 
 
-def verdict(acted: Acted) -> str:
+def verdict(acted: Acted, drawn: Drawn) -> str:
     """What a suite of probing says, in words made of its figures."""
     chosen, passive = acted.chosen(), acted.passive()
     if chosen is None or passive is None:
         return ""
-    drawn, name = acted.drawn(), chosen.diagnoser
+    name = chosen.diagnoser
     others = [r.diagnoser for r in acted.rows if family(r) == NEVER and not clairvoyant(r) and r.diagnoser not in UNSEEING]
     gain = drawn.difference(name, passive.diagnoser)
     far = horizon(acted.outcomes[name])
@@ -141,7 +142,7 @@ def verdict(acted: Acted) -> str:
 def tables(acted: Acted, width: int | None = None) -> str:
     """The tables of a suite."""
     if acted.suite.acts == "probing":
-        return "\n\n".join(part for part in (probing_table(acted, width), told(acted.rows)) if part)
+        return probing_table(acted, acted.drawn(), width)
     return f"{accommodation_table(acted, width)}\n\nCost by fault:\n\n{by_fault_table(acted, width)}"
 
 
@@ -156,7 +157,8 @@ def page(acted: Acted) -> str:
     words = PROBING.format(on_board=suite.on_board, period=period, passive=passive.diagnoser if passive else "nobody")
     shown = [f"\n![Accuracy against cost]({picture}.png)\n"]
     shown += [f"![A flight]({picture}-flight.png)\n"] if passive is not None and acted.chosen() is not None else []
-    return "\n".join([words, f"{verdict(acted)}\n", tables(acted), *shown])
+    drawn = acted.drawn()
+    return "\n".join([words, f"{verdict(acted, drawn)}\n", probing_table(acted, drawn), *shown])
 
 
 def _passed(row: Row) -> tuple[float, float, float]:
