@@ -1,8 +1,8 @@
 """An oracle for any plant: an extended Kalman filter per hypothesis, told when the label changes, not to what.
 
 The hypotheses are those of the multiple models: each label with the magnitudes of its own faults. Where the plant's sensors
-may fail, each sensor has four: its bias, its gain (a line in theta beside the estimated space), and noise that has grown
-little or much. At a change all of them start from what the healthy filter knows, with the magnitudes' prior, and the label
+may fail, each sensor has seven: its bias, a drift that reaches it soon, later or late, its gain (a line in theta beside the
+estimated space), and noise that has grown little or much. At a change all of them start from what the healthy filter knows, with the magnitudes' prior, and the label
 is the one whose likelihood since then is the largest on average over its hypotheses. While there is no fault that is known.
 
 On a plant whose linearisation is exact over the magnitudes this is the Bayes classifier within the known windows, up to
@@ -30,6 +30,7 @@ from fdi_gym.plant import Array, Plant
 from fdi_gym.sensors import GAIN, failing, sensor_mode
 
 GROWN = (3.0, 8.0)  # standard deviations of a noise that has grown, in units of the healthy one
+RISES = (0.13, 0.2, 0.27)  # how long a drift goes on, as shares of the flight
 
 
 class Rows(NamedTuple):
@@ -41,6 +42,7 @@ class Rows(NamedTuple):
     M0: Array  # (r, f, f)
     R: Array  # (r, m, m) noise of its sensors
     log_prior: Array  # (r,) within its label
+    rise: Array  # (r,) share of the flight in which its line grows to its length; 0: at once
 
 
 def rows(plant: Plant, belief: Belief) -> Rows:
@@ -54,11 +56,11 @@ def rows(plant: Plant, belief: Belief) -> Rows:
     assert model.lines is not None
     if plant.bare is None:
         R = np.tile(belief.R, (len(labels), 1, 1))
-        return Rows(model, labels, b.m0, b.M0, R, np.zeros(len(labels)))
+        return Rows(model, labels, b.m0, b.M0, R, np.zeros(len(labels)), np.zeros(len(labels)))
     offset, direction = model.lines
     sensors = [s.name for s in failing(plant)]
     entries = [plant.theta_entries.index(f"gain_{name}") for name in sensors]
-    count, kinds = len(sensors), 1 + len(GROWN)
+    count, kinds = len(sensors), 1 + len(GROWN) + len(RISES)
     of = np.array([plant.label_of(frozenset({sensor_mode(name)})) for name in sensors])
     label = np.concatenate([labels, np.repeat(of, kinds)])
     more, f = count * kinds, direction.shape[2]
@@ -68,17 +70,20 @@ def rows(plant: Plant, belief: Belief) -> Rows:
     wide[: len(labels), : offset.shape[1]] = direction
     m0, M0 = np.concatenate([b.m0, np.zeros((more, f))]), np.concatenate([b.M0, np.zeros((more, f, f))])
     R, Q = np.tile(belief.R, (len(label), 1, 1)), np.concatenate([model.Q, np.tile(model.Q[:1], (more, 1, 1))])
+    rise, share = np.zeros(len(label)), np.ones(len(label))
     heard = {plant.outputs[i].name: column for column, i in enumerate(belief.sensors)}
     for i, name in enumerate(sensors):
         first = len(labels) + kinds * i
         wide[first, offset.shape[1] + i, 0], M0[first, 0, 0] = 1.0, GAIN[1] ** 2 / 3
+        noisy, drifts = slice(first + 1, first + 1 + len(GROWN)), slice(first + 1 + len(GROWN), first + kinds)
         if name in heard:
-            for j, factor in enumerate(GROWN):
-                R[first + 1 + j, heard[name], heard[name]] *= factor**2
+            R[noisy, heard[name], heard[name]] *= np.square(GROWN)
+        wide[drifts, : offset.shape[1]], m0[drifts], M0[drifts] = direction[of[i]], b.m0[of[i]], b.M0[of[i]]
+        Q[drifts], rise[drifts] = model.Q[of[i]], RISES
+        share[noisy], share[drifts] = 1 / len(GROWN), 1 / len(RISES)
     inputs = model.inputs._replace(entries=np.concatenate([model.inputs.entries, entries]).astype(np.int64))
     model = model.replace(inputs=inputs, Q=Q, H=None, lines=(wide_offset, wide))
-    shares = np.bincount(label)
-    return Rows(model, label, m0, M0, R, -np.log(shares[label]))
+    return Rows(model, label, m0, M0, R, np.log(share / np.bincount(label, share)[label]), rise)
 
 
 class Bank(NamedTuple):
@@ -92,11 +97,13 @@ class Bank(NamedTuple):
     course: Array  # (n, K + 1) size of what acts, as a share of its largest; (n, 1) where that is not told
     allowed: Array  # (n, K + 1, labels) bool: which can be; (n, 1, labels) where that is not told
     now: Array  # (n,) bool: a fault acts
-    share: Array  # (n,) of the course
+    since: Array  # (n,) samples since the label has changed
+    length: Array  # (n, r) of the lines, as shares of their own
     among: Array  # (n, labels) bool, of the allowed
     nu: Array  # (n, m) innovation of the healthy filter
     S: Array  # (n, m, m) its covariance
     checks: Checks | None
+    rise: Array  # (n, r) samples in which the lines grow
 
 
 @diagnoser(
@@ -135,6 +142,7 @@ def told_bank(
     assert model.lines is not None
     offset, direction = model.lines
     own = offset.shape[1] if plant.bare is None else len(plant.estimated)
+    rise = r.rise * np.array([scenario.steps for scenario in scenarios])[:, None]
     checks = None if plant.bare is None else SensorChecks(plant)
 
     def start(n: int) -> Bank:
@@ -143,37 +151,39 @@ def told_bank(
         every = np.ones((n, labels), bool)
         return Bank(
             X, P, np.zeros((n, count)), changes, acts, np.ones((n, 1)) if course is None else course,
-            every[:, None] if allowed is None else allowed, np.zeros(n, bool), np.ones(n), every, np.zeros((n, m)),
-            np.tile(r.R[0], (n, 1, 1)), None if checks is None else checks.start(n),
+            every[:, None] if allowed is None else allowed, np.zeros(n, bool), np.zeros(n), np.ones((n, count)), every,
+            np.zeros((n, m)), np.tile(r.R[0], (n, 1, 1)), None if checks is None else checks.start(n), rise,
         )  # fmt: skip
 
-    def sized(share: Array) -> AugmentedModel:
+    def sized(length: Array) -> AugmentedModel:
         """The model whose lines are as long as what acts is large."""
-        if (share == 1.0).all():
+        if (length == 1.0).all():
             return model
-        wide = np.repeat(share, count)[:, None]
-        lines = (wide * np.tile(offset, (len(share), 1)), wide[..., None] * np.tile(direction, (len(share), 1, 1)))
+        wide = length.reshape(-1, 1)
+        lines = (wide * np.tile(offset, (len(length), 1)), wide[..., None] * np.tile(direction, (len(length), 1, 1)))
         return model.replace(lines=lines)
 
     def predict(s: Bank, at: Interval) -> Bank:
         n = len(at.k)
         each, k = np.arange(n), np.minimum(at.k, s.acts.shape[1] - 1)
         changed, now = s.changes[each, k], s.acts[each, k]
+        since = np.where(changed, 1.0, s.since + 1.0)
         share = s.course[each, np.minimum(k, s.course.shape[1] - 1)]
+        length = share[:, None] * np.where(now[:, None], np.minimum(since[:, None] / np.maximum(s.rise, 1.0), 1.0), 1.0)
         X, P, log = s.X.copy(), s.P.copy(), np.where(changed[:, None], 0.0, s.log)
         X[changed], P[changed] = X[changed, :1], P[changed, :1]
         X[..., z] = np.where(changed[:, None, None], r.m0, X[..., z])
         P[changed, :, z, :] = 0.0
         P[changed, :, :, z] = 0.0
         P[..., z, z] = np.where(changed[:, None, None, None], r.M0, P[..., z, z])
-        X1, P1 = sized(share).predict("extended", X.reshape(-1, N), P.reshape(-1, N, N), at)
+        X1, P1 = sized(length).predict("extended", X.reshape(-1, N), P.reshape(-1, N, N), at)
         among = s.allowed[each, np.minimum(k, s.allowed.shape[1] - 1)]
         X1, P1 = X1.reshape(n, count, N), P1.reshape(n, count, N, N)
-        return s._replace(X=X1, P=P1, log=log, now=now, share=share, among=among)
+        return s._replace(X=X1, P=P1, log=log, now=now, since=since, length=length, among=among)
 
     def update(s: Bank, at: Interval, y: Array, seen: Array) -> Bank:
         n = len(s.now)
-        done = sized(s.share).update("extended", s.X.reshape(-1, N), s.P.reshape(-1, N, N), at, y, seen, r.R)
+        done = sized(s.length).update("extended", s.X.reshape(-1, N), s.P.reshape(-1, N, N), at, y, seen, r.R)
         found = s._replace(
             X=done.X.reshape(n, count, N), P=done.P.reshape(n, count, N, N), nu=done.nu.reshape(n, count, m)[:, 0],
             S=done.S.reshape(n, count, m, m)[:, 0], log=s.log + done.log_likelihood.reshape(n, count),
@@ -198,8 +208,8 @@ def told_bank(
         probs = np.exp(by_label - logsumexp(by_label, axis=1, keepdims=True))
         weight = np.exp(log - logsumexp(log[:, 1:], axis=1, keepdims=True)) * s.now[:, None]
         weight[:, 0] = 0.0
-        deviation = offset + (direction @ s.X[..., z, None])[..., 0]
-        mean = s.share[:, None] * (weight[..., None] * deviation).sum(axis=1)[:, :own]
+        deviation = s.length[..., None] * (offset + (direction @ s.X[..., z, None])[..., 0])
+        mean = (weight[..., None] * deviation).sum(axis=1)[:, :own]
         return Reading(mean, x=s.X[:, 0, x], nu=s.nu, S=s.S, probs=probs)
 
     rule = by_candidate(lambda reading, label: np.argmax(np.asarray(reading.probs), axis=1), 1)
