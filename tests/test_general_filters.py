@@ -509,6 +509,7 @@ def test_builders_fly_nothing_and_say_why_they_cannot(monkeypatch, plant_id, nam
     given = {"belief": belief_of(plant)} if entry.takes("belief") else {}
     given |= {"calibration": Calibration()} if entry.takes("calibration") else {}
     given |= {"scenarios": [draw(plant.process("standard"), 0)]} if entry.clairvoyant else {}
+    given |= {"process": "standard"} if entry.takes("process") else {}
 
     def fly(*_):
         raise AssertionError("a builder flies")
@@ -525,7 +526,8 @@ def test_builders_fly_nothing_and_say_why_they_cannot(monkeypatch, plant_id, nam
         not reason
         or name in FAMILY
         or re.search(
-            "no trained weights|no label of|no unknown-input observer|are allowed|too much|the three tanks only", reason
+            "no trained weights|no label of|no unknown-input observer|are allowed|too much|three tanks only|overlap in time",
+            reason,
         )
     ), reason
     with pytest.raises(ValueError, match="no such"):

@@ -16,7 +16,7 @@ import numpy as np
 
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.estimation import mixing
-from fdi_gym.estimation.augmented import AugmentedModel, augmented
+from fdi_gym.estimation.augmented import AugmentedModel, augmented, on_lines
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_labels
@@ -44,7 +44,7 @@ def hypotheses(plant: Plant, belief: Belief) -> Hypotheses:
         NotApplicableError: The fault vector does not enter additively.
     """
     base, p = augmented(plant, belief), belief
-    labels, n_x = len(plant.labels), len(plant.states)
+    labels = len(plant.labels)
     width = max(1, *magnitudes_of_labels(plant).tolist())
     number = {mode.name: i for i, mode in enumerate(plant.modes)}
     typical = np.sqrt(p.m_mean**2 + p.m_std**2)
@@ -61,25 +61,8 @@ def hypotheses(plant: Plant, belief: Belief) -> Hypotheses:
             direction[j, :, f] = line
             m0[j, f], walk[j, f] = p.m_mean[k], max(p.m_walk[k], SLOWEST_WALK * typical[k]) ** 2
             M0[j, f, f] = max(p.m_std[k], SMALLEST_MAGNITUDE * typical[k]) ** 2
-    N = n_x + width + len(p.disturbances)
-    z, d = slice(n_x, n_x + width), slice(n_x + width, N)
-    rest = base.rest
-    keep = [*range(n_x), *range(d.start, N)]
-    Q = np.zeros((labels, N, N))
-    Q[np.ix_(range(labels), keep, keep)] = base.Q[np.ix_(rest, rest)]
-    Q[:, range(z.start, z.stop), range(z.start, z.stop)] = walk
-    P0 = np.zeros((N, N))
-    P0[np.ix_(keep, keep)] = base.P0[np.ix_(rest, rest)]
-    X0, scale = np.zeros(N), np.ones(N)
-    X0[keep], scale[keep] = base.X0[rest], base.scale[rest]
-    scale[z] = max(float(typical.max()), 1e-12)
-    limit = np.full(N, np.inf)
+    model = on_lines(base, offset, direction, walk, max(float(typical.max()), 1e-12))
     change = p.changes / (labels - 1)
-    H = None
-    if base.H is not None and not base.H[:, base.z].any():
-        H = np.zeros((len(base.R), N))
-        H[:, keep] = base.H[:, rest]
-    model = base.replace(z=z, d=d, scale=scale, X0=X0, P0=P0, Q=Q, limit=limit, H=H, lines=(offset, direction))
     return Hypotheses(model, m0, M0, np.full((labels, labels), change) + (1 - change * labels) * np.eye(labels))
 
 

@@ -2,8 +2,9 @@
 
 The hypotheses are those of the multiple models: each label with the magnitudes of its own faults. Where the plant's sensors
 may fail, each sensor has seven: its bias, a drift that reaches it soon, later or late, its gain (a line in theta beside the
-estimated space), and noise that has grown little or much. At a change all of them start from what the healthy filter knows, with the magnitudes' prior, and the label
-is the one whose likelihood since then is the largest on average over its hypotheses. While there is no fault that is known.
+estimated space), and noise that has grown little or much. At a change all of them start from what the healthy filter knows,
+with the magnitudes' prior, and the label is the one whose likelihood since then is the largest on average over its
+hypotheses. While there is no fault that is known.
 
 On a plant whose linearisation is exact over the magnitudes this is the Bayes classifier within the known windows, up to
 the shape of the prior.

@@ -190,3 +190,42 @@ def augmented(
         X0=X0, P0=P0, Q=Q, R=belief.R, limit=limit,
     )  # fmt: skip
     return model.replace(H=_linear_sensors(model))
+
+
+def on_lines(
+    base: AugmentedModel, offset: Array, direction: Array, walk: Array, size: float, entries: Array | None = None
+) -> AugmentedModel:
+    """The model of [x; m; d] on r lines, or planes: the fault vector is offset + direction m.
+
+    Args:
+        base: The augmented model of the plant.
+        offset: (r, p) deviations from healthy.
+        direction: (r, p, f).
+        walk: Variance (r, f) that a sample adds to the magnitudes.
+        size: Typical magnitude.
+        entries: Positions of the p entries in theta. Default: those of the fault vector.
+
+    Returns:
+        The model; X0 and P0 are those of healthy flight, zero for the magnitudes.
+    """
+    r, _, f = direction.shape
+    n_x, rest = base.x.stop, base.rest
+    N = len(rest) + f
+    z, d = slice(n_x, n_x + f), slice(n_x + f, N)
+    keep = [*range(n_x), *range(d.start, N)]
+    Q = np.zeros((r, N, N))
+    Q[np.ix_(range(r), keep, keep)] = base.Q[np.ix_(rest, rest)]
+    Q[:, range(z.start, z.stop), range(z.start, z.stop)] = walk
+    P0 = np.zeros((N, N))
+    P0[np.ix_(keep, keep)] = base.P0[np.ix_(rest, rest)]
+    X0, scale = np.zeros(N), np.full(N, size)
+    X0[keep], scale[keep] = base.X0[rest], base.scale[rest]
+    H = None
+    if entries is None and base.H is not None and not base.H[:, base.z].any():
+        H = np.zeros((len(base.R), N))
+        H[:, keep] = base.H[:, rest]
+    inputs = base.inputs if entries is None else base.inputs._replace(entries=entries)
+    model = base.replace(
+        inputs=inputs, z=z, d=d, scale=scale, X0=X0, P0=P0, Q=Q, limit=np.full(N, np.inf), H=H, lines=(offset, direction)
+    )
+    return model if entries is None else model.replace(H=_linear_sensors(model))

@@ -3,7 +3,8 @@
 The model is the augmented one, X = [x; m; d]: the plant's state, magnitudes of its faults and disturbances that nothing
 measures. theta is nominal but for theta[entries], to which offset + direction m is added: an ordinary filter has the one
 line "offset 0, direction I", a bank one line for each of its models, and row i of a stack lies on line i % lines. f moves
-x by one sample (theta, d and the command held) and leaves m and d; h gives the chosen sensors. A Gaussian passes through
+x by one sample (theta, d and the command held) and leaves m and d; an entry beyond theta is one of the plant's physical
+parameters; h gives the chosen sensors. A Gaussian passes through
 f and h by one of three rules:
 
     "extended"            A. H. Jazwinski, Stochastic Processes and Filtering Theory, 1970; Jacobians by differences

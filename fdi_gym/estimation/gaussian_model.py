@@ -48,7 +48,7 @@ def bind(
     Args:
         plant: The plant.
         scale: Typical size of each entry of X (N,); the differences along the axes take a thousandth of it.
-        entries: Positions (p,) in theta that the faults move.
+        entries: Positions (p,) in theta that the faults move; beyond its end, in the physical parameters p.
         disturbances: Positions (n_d,) in the plant's disturbances of those in X.
         sensors: Positions (m,) in the plant's outputs of those that the filter hears. Default: all.
         limit: Largest variance (N,) that a prediction leaves an entry; where it is passed the entry's row and column
@@ -61,7 +61,7 @@ def bind(
     """
     n_x, n_theta, n_D = len(plant.states), len(plant.theta), len(plant.disturbances)
     where = {
-        "entries": _positions("entries", entries, n_theta),
+        "entries": _positions("entries", entries, n_theta + len(plant.nominal_p)),
         "disturbances": _positions("disturbances", disturbances, n_D),
         "sensors": _positions("sensors", range(len(plant.outputs)) if sensors is None else sensors, len(plant.outputs)),
     }
@@ -110,7 +110,7 @@ def _linear(plant: Plant, entries: Array) -> Array:
 
     Read off by unit steps, and compared with the plant at random points, since a declaration may be wrong.
     """
-    if not plant.linear:
+    if not plant.linear or (entries >= len(plant.theta)).any():
         return np.zeros((0, 0))
     n_x, n_u, n_D, p = len(plant.states), len(plant.commands), len(plant.disturbances), len(entries)
     x, u, d = np.zeros((1, n_x)), np.zeros((1, n_u)), np.zeros((1, n_D))

@@ -40,19 +40,21 @@ def pass_points(moving, integers, reals, offset, direction, t, points, u, known,
     n_m = direction.shape[1]
     entries, rest = integers[SIZES : SIZES + p], integers[SIZES + p :]
     disturbances, sensors = rest[:n_d], rest[n_d:]
-    dt, nominal, physical = reals[0], reals[1 : 1 + n_theta], reals[1 + n_theta :]
-    x, y, theta, theta_now, still = np.empty(n_x), np.empty(n_y), np.empty(n_theta), np.empty(n_theta), np.zeros(n_theta)
-    theta_p, theta_now, still = theta[:own], theta_now[:own], still[:own]  # the rest are faults of the sensors
+    dt, nominal = reals[0], reals[1:]
+    now = nominal.copy()
+    theta, physical = now[:n_theta], now[n_theta:]
+    x, y, theta_now, still = np.empty(n_x), np.empty(n_y), np.empty(own), np.zeros(own)
+    theta_p = theta[:own]  # the rest are faults of the sensors
     d = known.copy()
     k1, k2, k3, k4, z = np.empty(n_x), np.empty(n_x), np.empty(n_x), np.empty(n_x), np.empty(n_x)
     for i in range(points.shape[0]):
-        for j in range(n_theta):
-            theta[j] = nominal[j]
+        for e in range(p):
+            now[entries[e]] = nominal[entries[e]]
         for e in range(p):
             deviation = offset[e]
             for j in range(n_m):
                 deviation += direction[e, j] * points[i, n_x + j]
-            theta[entries[e]] += deviation
+            now[entries[e]] += deviation
         for j in range(n_d):
             d[disturbances[j]] = points[i, n_x + n_m + j]
         for j in range(n_x):

@@ -1,0 +1,284 @@
+"""Bayes' rule over what a fault process does: which kind of event, since when, how large. For any declared plant.
+
+A filter is told the process (`fdi_gym.estimation.events`): how likely a fault is to begin at any time, of which kind, how
+large, how long it lasts, and which physical parameters differ from flight to flight: those are estimated too. One extended
+Kalman filter flies healthy. At every few samples each kind of event may have begun: a filter starts from what the healthy
+one knows, with the magnitudes' prior, and goes on by itself; its weight is the probability of that beginning, times the
+likelihood of what was measured since. A kind keeps so many onsets: of neighbours those two become one, mean and covariance
+matched, that are least likely for how close they are. Where events end, the filters' weight goes back to the healthy one,
+which becomes the mixture.
+
+With a linear model, Gaussian sizes and as many onsets as samples this is the Bayes diagnoser of the process, what any method
+could attain that is told no more: the line by which others are measured, as far as its score stands still when onsets, cells
+of the sizes and of the courses are made more. The label is the most probable one in proportion to its share of all samples,
+which is the decision that balanced accuracy asks for.
+
+The bank of hypotheses is D. T. Magill's, IEEE TAC 10(4), 1965; onsets kept in limited number: A. S. Willsky, H. L. Jones,
+IEEE TAC 21(1), 1976, and the generalised pseudo-Bayes estimators of J. K. Tugnait, Automatica 18(5), 1982.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from scipy.special import logsumexp
+
+from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
+from fdi_gym.diagnosis.fitting import FLOOR, VALIDATION_SEED
+from fdi_gym.estimation.augmented import AugmentedModel, augmented, on_lines
+from fdi_gym.estimation.belief import Belief, fault_inputs
+from fdi_gym.estimation.decision import Reading, by_candidate
+from fdi_gym.estimation.events import Events, events_of
+from fdi_gym.estimation.interval import Interval
+from fdi_gym.estimation.mixing import mixture
+from fdi_gym.faults import draw
+from fdi_gym.plant import Array, NotApplicableError, Plant
+
+FIRST, DRAWN = 700_000, 2000  # scenarios from VALIDATION_SEED + FIRST on
+GRID = 200  # onsets in a flight, where it is not said how far they are apart
+NEVER = -1e300  # log weight of a place where nothing is
+
+
+class Onsets(NamedTuple):
+    """State: the healthy filter, and r kinds of events with s onsets each."""
+
+    X: Array  # (n, 1 + r s, N), the healthy one first, then kind by kind, the latest onset last
+    P: Array  # (n, 1 + r s, N, N)
+    log: Array  # (n, 1 + r s) log weights
+    onset: Array  # (n, r, s) steps at which they began; between two, where those became one
+    held: Array  # (n, r, s, p) deviation of held entries
+    length: Array  # (n, r, s) of the courses
+    first: Array  # (n,) share of the healthy weight that no event came before
+    since: Array  # (n,) step at which the last one ended for the others, on average
+    u: Array  # (n, n_u) the command before the last
+    nu: Array  # (n, m) innovation of the healthy filter
+    S: Array  # (n, m, m) its covariance
+
+
+def on_model(plant: Plant, belief: Belief) -> Belief:
+    """The belief with the declared noises alone: the errors of the model are estimated, not covered by noise."""
+    Q = plant.Q.copy()
+    Q[np.diag_indices_from(Q)] += np.where(np.diag(Q) > 0, 0.0, (FLOOR * np.array([s.scale for s in plant.states])) ** 2)
+    return msgspec.structs.replace(belief, Q=Q, R=plant.R[np.ix_(belief.sensors, belief.sensors)])
+
+
+def merged(log: Array, X: Array, P: Array) -> tuple[Array, Array, Array]:
+    """Log weight (a,), mean (a, N) and covariance (a, N, N) of the mixtures of log (a, b), X (a, b, N), P (a, b, N, N)."""
+    total = np.asarray(logsumexp(log, axis=1))
+    w = np.exp(log - total[:, None])[:, None]
+    mean, covariance = mixture(w, X, P)
+    return total, mean[:, 0], covariance[:, 0]
+
+
+class Bank:
+    """The filter's functions for a plant, a belief and events."""
+
+    def __init__(self, plant: Plant, belief: Belief, events: Events, onsets: int, every: int):
+        self.plant, self.events, self.s, self.every = plant, events, onsets, every
+        (r, p, f), (e, c) = events.direction.shape, events.spread.shape
+        entries = np.concatenate([events.entries, len(plant.theta) + events.physical])
+        base = augmented(plant, belief if c == 0 else on_model(plant, belief))
+        model = on_lines(base, np.zeros((1, p + e)), np.zeros((1, p + e, f + c)), np.zeros((1, f + c)), 1.0, entries)
+        self.m = slice(model.z.start, model.z.start + f)  # magnitudes of the event; then those of the parameters
+        P0 = model.P0.copy()
+        P0[range(self.m.stop, model.z.stop), range(self.m.stop, model.z.stop)] = 1.0
+        self.model, self.r, self.count = model.replace(P0=P0), r, 1 + r * onsets
+        self.M0 = np.zeros((r, f, f))
+        self.M0[:, range(f), range(f)] = events.direction.any(axis=1)
+        inputs = fault_inputs(plant)
+        places = events.entries.tolist()
+        self.p = len(inputs.entries)
+        self.known = [(j, places.index(e)) for j, e in enumerate(inputs.entries.tolist()) if e in places]
+
+    def start(self, n: int) -> Onsets:
+        """Healthy, and nothing has begun."""
+        model, (r, p, _), s = self.model, self.events.direction.shape, self.s
+        log = np.full((n, self.count), NEVER)
+        log[:, 0] = 0.0
+        m = len(model.R)
+        return Onsets(
+            np.tile(model.X0, (n, self.count, 1)), np.tile(model.P0, (n, self.count, 1, 1)), log, np.zeros((n, r, s)),
+            np.zeros((n, r, s, p)), np.ones((n, r, s)), np.ones(n), np.zeros(n),
+            np.tile(self.plant.trim_command, (n, 1)), np.zeros((n, m)), np.tile(model.R, (n, 1, 1)),
+        )  # fmt: skip
+
+    def lines(self, s: Onsets) -> tuple[Array, Array]:
+        """Offsets and directions of all filters: (n (1 + r s), p), (n (1 + r s), p, f)."""
+        n, (_, p, f), (e, c) = len(s.X), self.events.direction.shape, self.events.spread.shape
+        offset, direction = np.zeros((n, self.count, p + e)), np.zeros((n, self.count, p + e, f + c))
+        wide = s.length[..., None] * self.events.offset[:, None] + s.held
+        offset[:, 1:, :p] = wide.reshape(n, -1, p)
+        direction[:, 1:, :p, :f] = (s.length[..., None, None] * self.events.direction[:, None]).reshape(n, -1, p, f)
+        direction[:, :, p:, f:] = self.events.spread
+        return offset.reshape(-1, p + e), direction.reshape(-1, p + e, f + c)
+
+    def sized(self, s: Onsets) -> AugmentedModel:
+        """The model with these lines."""
+        return self.model.replace(lines=self.lines(s))
+
+    def ended(self, s: Onsets, step: Array) -> Onsets:
+        """The weight of events that end within the period before a step goes back to the healthy filter."""
+        end = self.events.end
+        age = np.clip((step[:, None, None] - s.onset).astype(np.int64), 0, None)
+        stays = np.concatenate([[0.0], np.cumsum(np.log1p(-np.minimum(end, 1 - 1e-12)))])
+        last = len(stays) - 1
+        log_stay = stays[np.minimum(age, last)] - stays[np.clip(age - self.every, 0, last)]
+        log_stay = np.where(age > last, -30.0, log_stay).reshape(len(step), -1)
+        with np.errstate(divide="ignore"):
+            leaving = np.maximum(s.log[:, 1:] + np.log(-np.expm1(log_stay)), NEVER)
+        X, P = s.X.copy(), s.P.copy()
+        X[..., self.m], P[..., self.m, :], P[..., :, self.m] = 0.0, 0.0, 0.0
+        log = np.concatenate([s.log[:, :1], leaving], axis=1)
+        total, mean, covariance = merged(log, X, P)
+        X, P, stayed = s.X.copy(), s.P.copy(), np.exp(s.log[:, 0] - total)
+        X[:, 0], P[:, 0] = mean, covariance
+        log = np.concatenate([total[:, None], np.maximum(s.log[:, 1:] + log_stay, NEVER)], axis=1)
+        first, others = s.first * stayed, np.maximum(1.0 - s.first * stayed, 1e-12)
+        since = ((1.0 - s.first) * stayed * s.since + (1.0 - stayed) * (step - self.every / 2)) / others
+        return s._replace(X=X, P=P, log=log, first=first, since=since)
+
+    def begun(self, s: Onsets, step: Array, u: Array) -> Onsets:
+        """Each kind of event may have begun at a step: the newest onset; two older ones become one."""
+        n, r, slots, N, e = len(step), self.r, self.s, len(self.model.scale), self.events
+        X, P = s.X[:, 1:].reshape(n, r, slots, N), s.P[:, 1:].reshape(n, r, slots, N, N)
+        log, z = s.log[:, 1:].reshape(n, r, slots), self.m
+        each = np.arange(n)[:, None], np.arange(r)
+        # which of the neighbours become one: least likely, and close for their age
+        age = step[:, None, None] - s.onset
+        gap = np.diff(s.onset, axis=2) / (age[..., 1:] + self.every)
+        pair = np.logaddexp(log[..., :-1], log[..., 1:]) + 2.0 * np.log(np.maximum(gap, 1e-9))
+        pair = np.where(log[..., :-1] <= NEVER, -np.inf, pair)  # empty places first
+        j = np.argmin(pair, axis=2)
+        two = np.stack([j, j + 1], axis=2)
+        at = (each[0][..., None], each[1][:, None], two)
+        both = log[at].reshape(-1, 2)
+        total, mean, covariance = merged(both, X[at].reshape(-1, 2, N), P[at].reshape(-1, 2, N, N))
+        share = np.exp(both[:, 1] - total).reshape(n, r)
+        middle = (1 - share) * s.onset[(*each, j)] + share * s.onset[(*each, j + 1)]
+        heavier = np.where(share > 0.5, j + 1, j)
+        held_one = s.held[(*each, heavier)]
+        # the places after the pair move up by one, the last is free
+        order = np.arange(slots) + (np.arange(slots) > j[..., None])
+        order[..., -1] = slots - 1
+        take = (each[0][..., None], each[1][:, None], order)
+        X, P, log, onset, held = X[take], P[take], log[take], s.onset[take], s.held[take]
+        X[(*each, j)], P[(*each, j)] = mean.reshape(n, r, N), covariance.reshape(n, r, N, N)
+        log[(*each, j)], onset[(*each, j)], held[(*each, j)] = total.reshape(n, r), middle, held_one
+        # the newest
+        X[:, :, -1], P[:, :, -1] = s.X[:, :1], s.P[:, :1]
+        X[:, :, -1, z] = 0.0
+        P[:, :, -1, z, :], P[:, :, -1, :, z] = 0.0, 0.0
+        P[:, :, -1, z, z] = self.M0
+        ahead, last = np.arange(self.every), len(e.onset) - 1
+        rate = s.first * e.onset[np.minimum(step[:, None] + ahead, last)].sum(axis=1)
+        gap = np.maximum(step - s.since, 0.0).astype(np.int64)
+        rate += (1.0 - s.first) * e.again[np.minimum(gap[:, None] + ahead, last)].sum(axis=1)
+        rate = np.clip(rate, 1e-12, 0.5)
+        log[:, :, -1] = np.maximum(s.log[:, :1] + np.log(rate)[:, None] + e.log_prior, NEVER)
+        onset[:, :, -1] = step[:, None]
+        commands = np.where(e.lag[None] > 0, s.u[:, np.maximum(e.held, 0)], u[:, np.maximum(e.held, 0)])
+        held[:, :, -1] = np.where(e.held >= 0, commands, 0.0)
+        whole_X, whole_P = s.X.copy(), s.P.copy()
+        whole_X[:, 1:], whole_P[:, 1:] = X.reshape(n, -1, N), P.reshape(n, -1, N, N)
+        weights = np.concatenate([s.log[:, :1] + np.log1p(-rate)[:, None], log.reshape(n, -1)], axis=1)
+        return s._replace(X=whole_X, P=whole_P, log=weights, onset=onset, held=held)
+
+    def predict(self, s: Onsets, at: Interval) -> Onsets:
+        """Over the interval: what may end or begin at its start does."""
+        n, step = len(at.k), at.k - 1
+        turn = np.flatnonzero(step % self.every == 0)
+        if turn.size:
+            part = Onsets(*(a[turn] for a in s))
+            if self.events.end.size:
+                part = self.ended(part, step[turn])
+            part = self.begun(part, step[turn], at.u[turn])
+            if turn.size == n:
+                s = part
+            else:
+                whole = Onsets(*(a.copy() for a in s))
+                for a, new in zip(whole, part, strict=True):
+                    a[turn] = new
+                s = whole
+        age = (at.k[:, None, None] - s.onset) * self.plant.dt
+        s = s._replace(length=self.events.at(np.maximum(age, 0.0)), u=at.u)
+        N = len(self.model.scale)
+        X, P = self.sized(s).predict("extended", s.X.reshape(-1, N), s.P.reshape(-1, N, N), at)
+        return s._replace(X=X.reshape(s.X.shape), P=P.reshape(s.P.shape))
+
+    def update(self, s: Onsets, at: Interval, y: Array, seen: Array) -> Onsets:
+        """Weigh and correct all."""
+        N, m, n = len(self.model.scale), len(self.model.R), len(s.X)
+        done = self.sized(s).update("extended", s.X.reshape(-1, N), s.P.reshape(-1, N, N), at, y, seen)
+        log = np.maximum(s.log + done.log_likelihood.reshape(n, -1), NEVER)
+        log = np.where(s.log <= NEVER, NEVER, log - logsumexp(log, axis=1, keepdims=True))
+        return s._replace(
+            X=done.X.reshape(s.X.shape), P=done.P.reshape(s.P.shape), log=log, nu=done.nu.reshape(n, -1, m)[:, 0],
+            S=done.S.reshape(n, -1, m, m)[:, 0],
+        )  # fmt: skip
+
+    def read(self, s: Onsets) -> Reading:
+        """Probabilities of the labels, and the mean of the fault vector."""
+        n, w = len(s.X), np.exp(s.log)
+        probs = np.zeros((n, len(self.plant.labels)))
+        probs[:, 0] = w[:, 0]
+        by_kind = w[:, 1:].reshape(n, self.r, self.s).sum(axis=2)
+        for kind, label in enumerate(self.events.label.tolist()):
+            probs[:, label] += by_kind[:, kind]
+        probs /= probs.sum(axis=1, keepdims=True)
+        offset, direction = self.lines(s)
+        theta = offset + (direction @ s.X[..., self.model.z].reshape(len(offset), -1, 1))[..., 0]
+        mean = (w[..., None] * theta.reshape(n, self.count, -1)).sum(axis=1)
+        z = np.zeros((n, self.p))
+        for j, place in self.known:
+            z[:, j] = mean[:, place]
+        x = (w[..., None] * s.X[..., self.model.x]).sum(axis=1)
+        return Reading(z, x=x, nu=s.nu, S=s.S, probs=probs)
+
+    def expect(self, s: Onsets, at: Interval) -> Array:
+        """What the healthy filter expects the sensors to read."""
+        return self.model.expect(s.X[:, 0, self.model.x], at)
+
+
+@diagnoser("onset_bank", "Bayes' rule over onset, kind and size of the process's faults: what can be attained")
+def onset_bank(
+    plant: Plant,
+    belief: Belief,
+    process: str,
+    *,
+    onsets: int = 6,
+    courses: int = 3,
+    sizes: int = 1,
+    every: int | None = None,
+) -> Diagnoser:
+    """The bank.
+
+    Args:
+        plant: Any plant whose faults act through theta, one event after the other.
+        belief: Model errors, and what is unknown beside faults.
+        process: The fault process, of which it is told all but the draws.
+        onsets: How many of each kind are kept, 2 or more.
+        courses: Cells of kinds whose course in time varies.
+        sizes: Cells of each of those by the size.
+        every: Samples from one onset to the next. Default: a two-hundredth of the flight.
+
+    Raises:
+        ValueError: A number out of range.
+        NotApplicableError: Sensors may fail too, faults overlap, or one has no course that could be known.
+    """
+    for name, value, least in (("onsets", onsets, 2), ("courses", courses, 1), ("sizes", sizes, 1)):
+        if value < least:
+            raise ValueError(f"{name} is {least} or more, not {value}")
+    if every is not None and every < 1:
+        raise ValueError(f"every is a sample or more, not {every}")
+    if plant.bare is not None:
+        raise NotApplicableError("sensors that fail by noise, freezing or spikes are no lines in theta")
+    scenarios = [draw(plant.process(process), VALIDATION_SEED + FIRST + i) for i in range(DRAWN)]
+    events = events_of(plant, scenarios, courses=courses, sizes=sizes)
+    steps = max(s.steps for s in scenarios)
+    bank = Bank(plant, belief, events, onsets, max(1, steps // GRID) if every is None else every)
+    share = events.share
+    balanced = np.where(share > 0, 1.0 / np.maximum(share, 1e-12), 0.0)
+    rule = by_candidate(lambda reading, label: np.argmax(np.asarray(reading.probs) * balanced, axis=1), 1)
+    return diagnoser_of(plant, Filter(bank.start, bank.predict, bank.update, bank.read, expect=bank.expect), rule)

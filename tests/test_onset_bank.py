@@ -1,0 +1,281 @@
+"""Bayes' rule over onset, kind and size: against brute force, and what it counts in a process."""
+
+import msgspec
+import numpy as np
+import pytest
+from conftest import build
+from numpy.testing import assert_allclose
+from scipy.stats import multivariate_normal
+
+from baselines.filters.onset_bank import Bank, merged, onset_bank
+from fdi_gym.diagnosis import make_diagnoser, run
+from fdi_gym.diagnosis.filtering import readings
+from fdi_gym.diagnosis.fitting import fit_belief
+from fdi_gym.engine import simulate
+from fdi_gym.estimation import gaussian
+from fdi_gym.estimation.events import RISES, SATURATES, events_of
+from fdi_gym.estimation.interval import Interval
+from fdi_gym.faults import Abrupt, Fault, FaultScenario, Hold, Incipient, Intermittent, Ramp, Samples, draw
+from fdi_gym.plant import NotApplicableError
+
+FIRST = 4_900_000  # seeds of neither test nor validation nor training flights
+
+
+def b747(steps=100, **fault):
+    """A flight of the Boeing with at most one fault."""
+    faults = [Fault("rudder LOE", "LOE", fault["onset"], [fault["effect"]], fault.get("end"))] if fault else []
+    return FaultScenario(plant="B747Lateral", steps=steps, faults=faults)
+
+
+# -- what a process does
+
+
+def test_probabilities_of_onsets_and_ends_are_those_of_the_draws():
+    effect = Abrupt("gamma_rudder", -0.5)
+    drawn = [b747(onset=20, effect=effect, end=50)] * 30 + [b747(onset=60, effect=effect, end=90)] * 30 + [b747()] * 40
+    e = events_of(build("B747Lateral"), drawn)
+    assert_allclose([e.onset[20], e.onset[60], e.onset.sum()], [30 / 100, 30 / 70, 30 / 100 + 30 / 70])
+    assert_allclose(e.end, np.eye(31)[30])
+    assert not e.again.any()
+    label = build("B747Lateral").label_of(frozenset({"rudder LOE"}))
+    assert_allclose(e.share[[0, label]], [1 - 0.18, 0.18])
+    assert_allclose(e.offset, [[-0.5 - build("B747Lateral").nominal_theta[e.entries[0]]]])
+
+
+def test_a_second_event_is_counted_from_the_end_of_the_first():
+    effect = Abrupt("gamma_rudder", -0.5)
+    twice = b747(onset=10, effect=effect, end=30)
+    twice = twice.replace(faults=[*twice.faults, Fault("rudder LOE", "LOE", 45, [effect], 60)])
+    e = events_of(build("B747Lateral"), [twice] * 20 + [b747(onset=10, effect=effect, end=30)] * 20)
+    assert_allclose([e.onset[10], e.again[15], e.again.sum()], [1.0, 1 / 3, 1 / 3])  # sixty times free again, twenty faults
+
+
+@pytest.mark.parametrize(
+    ("effect", "age", "share"),
+    [
+        (Incipient("gamma_rudder", -0.5, 2.0), 0.7, 1 - np.exp(-1.4)),
+        (Ramp("gamma_rudder", -0.5, 4.0), 1.0, 0.25),
+        (Ramp("gamma_rudder", -0.5, 4.0), 9.0, 1.0),
+        (Intermittent("gamma_rudder", -0.5, 2.0, 0.25), 4.4, 1.0),
+        (Intermittent("gamma_rudder", -0.5, 2.0, 0.25), 4.6, 0.0),
+        (Abrupt("gamma_rudder", -0.5), 0.0, 1.0),
+    ],
+)
+def test_courses_are_those_of_the_effects(effect, age, share):
+    e = events_of(build("B747Lateral"), [b747(onset=20, effect=effect)] * 20)
+    assert_allclose(e.at(np.full((1, 1), age)), [[share]])
+
+
+def test_cells_cut_what_varies_and_keep_its_moments():
+    rng = np.random.default_rng(0)
+    values, rates = -rng.uniform(0.2, 0.8, 400), rng.choice([0.5, 4.0], 400)
+    drawn = [b747(onset=20, effect=Incipient("gamma_rudder", v, r)) for v, r in zip(values, rates, strict=True)]
+    plant = build("B747Lateral")
+    e = events_of(plant, drawn, courses=2, sizes=2)
+    assert len(e.label) == 4
+    assert (e.course == SATURATES).all()
+    assert_allclose(np.exp(e.log_prior).sum(), 1.0)
+    whole = events_of(plant, drawn, courses=1, sizes=1)
+    assert_allclose(whole.offset[0, 0], (values - plant.nominal_theta[e.entries[0]]).mean())
+    assert_allclose(np.abs(whole.direction[0, 0]).max(), values.std())
+    w = np.exp(e.log_prior)
+    assert_allclose(w @ e.offset[:, 0], whole.offset[0, 0])
+    assert (np.abs(e.direction[:, 0]).max(axis=1) < 0.6 * values.std()).all()
+
+
+def test_parameters_that_vary_are_found_with_their_covariance():
+    plant = build("MissilePitch")
+    drawn = [draw(plant.process("standard"), FIRST + i) for i in range(300)]
+    e = events_of(plant, drawn)
+    rho = np.array([plant.physical(s.physical) for s in drawn])[:, e.physical] - plant.nominal_p[e.physical]
+    assert_allclose(e.spread @ e.spread.T, rho.T @ rho / len(rho), atol=1e-12)
+    assert len(e.physical) == 6
+    assert RISES not in e.course
+
+
+@pytest.mark.parametrize(
+    ("faults", "what"),
+    [
+        ([], "has no faults"),
+        ([Fault("rudder LOE", "LOE", 10, [Samples("gamma_rudder", [-0.1, -0.2])])], "no course that could be known"),
+        (
+            [
+                Fault("rudder LOE", "LOE", 10, [Abrupt("gamma_rudder", -0.5)]),
+                Fault("aileron LOE", "LOE", 20, [Abrupt("gamma_aileron", -0.5)]),
+            ],
+            "overlap in time",
+        ),
+    ],
+)
+def test_what_has_no_events_is_refused(faults, what):
+    with pytest.raises(NotApplicableError, match=what):
+        events_of(build("B747Lateral"), [b747().replace(faults=faults)])
+
+
+# -- the model
+
+
+def test_an_entry_beyond_theta_is_a_physical_parameter():
+    plant = build("MissilePitch")
+    n_x, n_theta = len(plant.states), len(plant.theta)
+    model = gaussian.bind(
+        plant, scale=np.ones(n_x + 1), entries=[n_theta + 3], lines=(np.zeros((1, 1)), np.full((1, 1, 1), 0.1))
+    )
+    rng = np.random.default_rng(1)
+    x = plant.trim_state + 0.05 * rng.standard_normal((4, n_x))
+    u = np.tile(plant.trim_command, (4, 1)) + 0.01
+    m = rng.standard_normal(4)
+    p = np.tile(plant.nominal_p, (4, 1))
+    p[:, 3] += 0.1 * m
+    d = np.tile([s.nominal for s in plant.disturbances], (4, 1)).astype(float) if plant.disturbances else None
+    X = np.column_stack([x, m])[:, None]
+    found = gaussian.f(model, X, np.zeros(4), u, d)[:, 0]
+    assert_allclose(found[:, :n_x], plant.propagate(np.zeros(4), x, u, None, d, p), rtol=1e-12)
+    assert not np.allclose(found[:, :n_x], plant.propagate(np.zeros(4), x, u, None, d), rtol=1e-9)
+    assert_allclose(found[:, n_x], m)
+
+
+def test_a_mixture_has_the_mean_and_covariance_of_its_parts():
+    rng = np.random.default_rng(2)
+    log, X = rng.standard_normal((3, 5)), rng.standard_normal((3, 5, 2))
+    P = np.array([[np.cov(rng.standard_normal((2, 9))) for _ in range(5)] for _ in range(3)])
+    total, mean, covariance = merged(log, X, P)
+    w = np.exp(log) / np.exp(log).sum(axis=1, keepdims=True)
+    assert_allclose(np.exp(total), np.exp(log).sum(axis=1))
+    assert_allclose(mean, np.einsum("ab,abi->ai", w, X))
+    second = np.einsum("ab,abij->aij", w, P + X[..., :, None] * X[..., None, :])
+    assert_allclose(covariance, second - mean[..., :, None] * mean[..., None, :])
+
+
+# -- Bayes by brute force
+
+
+def brute_force(plant, bank, obs, every):
+    """Log of p(healthy) and of each kind, from the joint density of all measurements under each kind and onset."""
+    e, model = bank.events, bank.model
+    y, u, _ = plant.split(obs)
+    K = len(obs) - 1
+    m = len(model.R)
+
+    def density(kind, onset):
+        """Mean and covariance of everything measured, stacked, by propagating the joint Gaussian of all states."""
+        mean, P = model.X0.copy(), model.P0.copy()
+        means, past = [], []  # past: covariance of the present state with each measurement
+        S = np.zeros(((K + 1) * m, (K + 1) * m))
+        for k in range(K + 1):
+            if k:
+                offset, direction = np.zeros((1, len(e.entries))), np.zeros((1, *e.direction.shape[1:]))
+                if kind is not None and k > onset:
+                    if k == onset + 1:
+                        mean[bank.m] = 0.0
+                        P[bank.m, :] = P[:, bank.m] = 0.0
+                        P[bank.m, bank.m] = bank.M0[kind]
+                        for c in past:
+                            c[bank.m] = 0.0
+                    offset, direction = e.offset[kind][None], e.direction[kind][None]
+                at = Interval(np.array([k]), u[k][None], None, np.zeros((1, 0)))
+                line = model.replace(lines=(offset, direction))
+                moved, F = line.jacobian_f(mean[None], at)
+                mean, P, past = moved[0], F[0] @ P @ F[0].T + model.Q[0], [F[0] @ c for c in past]
+            H = model.H
+            means.append(H @ mean)
+            for j, c in enumerate(past):
+                S[k * m : (k + 1) * m, j * m : (j + 1) * m] = H @ c
+                S[j * m : (j + 1) * m, k * m : (k + 1) * m] = (H @ c).T
+            S[k * m : (k + 1) * m, k * m : (k + 1) * m] = H @ P @ H.T + model.R
+            past.append(P @ H.T)
+        return multivariate_normal.logpdf(y[:, model.sensors].ravel(), np.concatenate(means), S)  # type: ignore[arg-type]
+
+    free, by_kind = 0.0, np.full((len(e.label), 0), 0.0)
+    for step in range(0, K, every):
+        rate = e.onset[step : step + every].sum()
+        each = [free + np.log(max(rate, 1e-12)) + e.log_prior[r] + density(r, step) for r in range(len(e.label))]
+        by_kind = np.column_stack([by_kind, each])
+        free += np.log1p(-max(rate, 1e-12))
+    return free + density(None, 0), np.logaddexp.reduce(by_kind, axis=1)
+
+
+def test_it_is_bayes_by_brute_force_where_all_onsets_are_kept():
+    plant = build("B747Lateral")
+    belief = msgspec.structs.replace(
+        fit_belief(plant, "standard"), disturbances=np.zeros(0, np.int64), d0=np.zeros(0), d_walk=np.zeros(0)
+    )
+    rng = np.random.default_rng(3)
+    drawn = [b747(40, onset=int(rng.integers(5, 35)), effect=Abrupt("gamma_rudder", -v)) for v in rng.uniform(0.1, 0.9, 60)]
+    drawn += [
+        b747(40).replace(faults=[Fault("aileron LOE", "LOE", int(rng.integers(5, 35)), [Abrupt("gamma_aileron", -v)])])
+        for v in rng.uniform(0.1, 0.9, 40)
+    ] + [b747(40)] * 20
+    events, every = events_of(plant, drawn), 8
+    bank = Bank(plant, belief, events, 40 // every + 1, every)
+    flights = [b747(40, onset=12, effect=Abrupt("gamma_rudder", -0.9)).replace(noise_seed=i) for i in range(2)]
+    record = simulate(plant, [s.replace(reference=draw(plant.process("standard"), FIRST).reference) for s in flights])
+    s = bank.start(2)
+    y, u, known = plant.split(record.obs)
+    for k in range(41):
+        at = Interval(np.full(2, k), u[:, k], None, known[:, k])
+        s = bank.predict(s, at) if k else s
+        s = bank.update(s, at, y[:, k], np.ones_like(y[:, k], bool))
+    for i in range(2):
+        healthy, kinds = brute_force(plant, bank, record.obs[i], every)
+        logs = np.array([healthy, *kinds])
+        expected = np.exp(logs - np.logaddexp.reduce(logs))
+        found = np.asarray(bank.read(s).probs)[i]
+        assert_allclose(found[[0, *events.label]], expected, rtol=1e-5, atol=1e-9)
+        assert 0.01 < expected.max() < 1.0 - 1e-6  # the comparison says something
+
+
+# -- as a diagnoser
+
+
+def test_more_onsets_change_little_and_it_is_the_best_where_faults_come_and_go():
+    plant = build("B747Lateral")
+    scenarios = [draw(plant.process("hard"), FIRST + i) for i in range(16)]
+    record = simulate(plant, scenarios)
+    valid = np.arange(record.obs.shape[1]) <= record.length[:, None]
+
+    def balanced(name, **settings):
+        said = run(make_diagnoser(name, plant, process="hard", **settings), record.obs)
+        return np.mean([(said.label[valid & (record.label == l)] == l).mean() for l in range(len(plant.labels))])  # noqa: E741
+
+    bank = balanced("onset_bank")
+    assert abs(bank - balanced("onset_bank", onsets=12, sizes=2)) < 0.02
+    assert bank > balanced("multiple_model_ekf") + 0.05
+
+
+def test_held_commands_are_those_at_the_onset():
+    plant = build("B747Lateral")
+    jam = Fault("rudder stuck", "jam", 300, [Abrupt("gamma_rudder", -1.0), Hold("b_rudder", "rudder")])
+    found = []
+    for i in range(4):
+        drawn = draw(plant.process("standard"), FIRST + 50 + i)
+        scenario = drawn.replace(faults=[jam])
+        record = simulate(plant, [scenario])
+        *_, (reading, _) = readings(plant, make_diagnoser("onset_bank", plant), record.obs)
+        entry = [s.name for s in plant.estimated].index("b_rudder")
+        found.append(
+            [
+                np.asarray(reading.z)[0, entry],
+                (record.target - plant.healthy)[0, -1, entry],
+                np.asarray(reading.probs)[0].argmax(),
+            ]
+        )
+    found = np.array(found)
+    assert (found[:, 2] == plant.label_of(frozenset({"rudder stuck"}))).mean() >= 0.75
+    assert_allclose(found[:, 0], found[:, 1], atol=0.06)
+
+
+@pytest.mark.parametrize(
+    ("settings", "what"),
+    [({"onsets": 1}, "onsets is 2 or more"), ({"courses": 0}, "courses is 1 or more"), ({"sizes": 0}, "sizes is 1"),
+     ({"every": 0}, "every is a sample or more")],
+)  # fmt: skip
+def test_numbers_out_of_range_are_refused(settings, what):
+    with pytest.raises(ValueError, match=what):
+        make_diagnoser("onset_bank", build("B747Lateral"), **settings)
+
+
+def test_where_sensors_may_fail_it_says_why_it_cannot():
+    plant = build("B747Lateral", sensor_faults=True)
+    with pytest.raises(NotApplicableError, match="no lines in theta"):
+        onset_bank(plant, fit_belief(plant, "mixed"), "mixed")
