@@ -38,6 +38,8 @@ one decision about each window of a fault, and one about each healthy flight. Fo
 
 - **Isolation**: balanced accuracy, the mean over the labels of the share of right answers, in percent, per sample (outside
   the grace after a change) and per decision. Raw accuracy never ranks: often "always none" is right most of the time.
+  Attained: the way from chance to what can be attained that a method has gone, in percent. What can be attained lies
+  between the best that is told nothing and the ceiling, so there are two figures: [how wide that bracket is](attainable.md).
   S/M/L: share of right samples while the smallest active fault is small, medium, large. The log score is the mean log
   probability of the true label. Methods that declare one label throughout are not ranked here.
 - **Detection**: mean of the share of healthy samples without and of faulty samples with an alarm. Beside it false alarms
@@ -89,6 +91,17 @@ class Board(NamedTuple):
         """The rows as those of a suite whose flights are acted on."""
         return Acted(suite, self.plant, self.rows, self.outcomes)
 
+    def attainable(self) -> list[float]:
+        """The scores per sample between which what can be attained lies: of the best that is told nothing, and of a ceiling.
+
+        Empty where the board has no ceiling, or nothing that it could hold for.
+        """
+        best, above = self.best(), [row for row in self.rows if ceiling(row)]
+        if best is None or not above:
+            return []
+        scores = [row.metrics["per_sample"]["balanced_accuracy"] for row in (best, *above)]
+        return [scores[0], max(scores)]
+
     def best(self) -> Row | None:
         """The best row of a method that is told nothing."""
         return max(self.honest(), key=lambda row: row.metrics["per_sample"]["balanced_accuracy"], default=None)
@@ -134,12 +147,14 @@ def tables(board: Board, columns: tuple[str, ...] = (), width: int | None = None
     if columns:
         rows = RANKINGS["Isolation"][0](board.rows)
         rows += [row for row in RANKINGS["Detection"][0](board.rows) if row not in rows]
-        return f"{table(rows, board.times, columns, tied, width=width)}\n\n{told(rows)}".rstrip()
+        text = table(rows, board.times, columns, tied, width=width, attainable=board.attainable())
+        return f"{text}\n\n{told(rows)}".rstrip()
     parts = []
     for name, (rank, shown) in RANKINGS.items():
         rows = rank(board.rows)
         plant = board.plant if name == "Identification" else None
-        parts.append(f"## {name}\n\n{table(rows, board.times, shown, tied, plant, width) if rows else 'No rows.'}\n")
+        text = table(rows, board.times, shown, tied, plant, width, board.attainable()) if rows else "No rows."
+        parts.append(f"## {name}\n\n{text}\n")
     constant = [plain(row.diagnoser) for row in board.rows if not isolates(row) and row.diagnoser not in FLOOR]
     if constant:
         parts.insert(1, f"Not ranked, since they declare one label throughout: {', '.join(constant)}.\n")

@@ -69,6 +69,7 @@ class Line(NamedTuple):
     row: Row
     microseconds: float | None  # per sample
     tied: bool  # cannot be told from the best
+    attainable: Sequence[float]  # the scores between which that lies which can be attained; empty: not known
 
 
 def _percent(value: float | None, interval: Sequence[float] | None = None) -> str:
@@ -104,6 +105,15 @@ def _severity(m: Mapping[str, Any]) -> str:
     return "/".join("-" if b is None else f"{100 * b:.0f}" for b in bands)
 
 
+def _attained(line: Line) -> str:
+    per_sample = line.row.metrics["per_sample"]
+    score, chance = per_sample["balanced_accuracy"], 1.0 / len(per_sample["confusion"])
+    if score is None or ceiling(line.row) or not line.attainable or min(line.attainable) <= chance:
+        return "-"
+    low, high = sorted(100 * max(score - chance, 0.0) / (bound - chance) for bound in line.attainable)
+    return f"{low:.0f}-{high:.0f}"
+
+
 def _estimated(figure: str, digits: int, factor: float = 1.0) -> Callable[[Line], str]:
     def text(line: Line) -> str:
         found = line.row.metrics["identification"]
@@ -117,6 +127,7 @@ COLUMNS: dict[str, tuple[str, Callable[[Line], str]]] = {
     "tied": ("best", lambda a: "=" if a.tied else ""),
     "sample": ("per sample %", lambda a: _score(a.row.metrics["per_sample"])),
     "decision": ("per decision %", lambda a: _score(a.row.metrics["per_decision"])),
+    "attained": ("attained %", _attained),
     "raw": ("raw %", lambda a: _percent(a.row.metrics["per_sample"]["accuracy"])),
     "f1": ("F1", lambda a: _number(a.row.metrics["per_sample"]["macro_f1"], 3)),
     "severity": ("S/M/L %", lambda a: _severity(a.row.metrics)),
@@ -138,7 +149,7 @@ COLUMNS: dict[str, tuple[str, Callable[[Line], str]]] = {
     "size": ("size error %", lambda a: _percent(a.row.metrics["scenario"]["size_error"])),
     "time": ("us/sample", lambda a: _number(a.microseconds, 1)),
 }
-ISOLATION = ("tied", "sample", "decision", "severity", "isolated", "log", "time")
+ISOLATION = ("tied", "sample", "attained", "decision", "severity", "isolated", "log", "time")
 DETECTION = ("detection", "alarms", "under", "begun", "missed", "detected")
 IDENTIFICATION = ("error", "coverage", "nees")
 SCENARIO = ("worth", "exact", "onset", "overlap", "size")
@@ -195,6 +206,7 @@ def table(
     tied: Collection[str] = (),
     plant: Plant | None = None,
     width: int | None = None,
+    attainable: Sequence[float] = (),
 ) -> str:
     """A table as Markdown, in the order of the rows. Methods that know a part of the truth are marked *.
 
@@ -204,6 +216,7 @@ def table(
         columns: Keys of COLUMNS.
         tied: The diagnosers that cannot be told from the best.
         width: What is wider goes on below.
+        attainable: The scores per sample between which that lies which can be attained.
         plant: Adds the root mean square error of each estimated entry while a fault acts, with its unit.
 
     Raises:
@@ -217,7 +230,7 @@ def table(
     head += [f"{entry.name}{f' {entry.unit}' if entry.unit else ''}" for entry in entries]
     body = []
     for row in rows:
-        line = Line(row, timing.get(row.diagnoser), row.diagnoser in tied)
+        line = Line(row, timing.get(row.diagnoser), row.diagnoser in tied, attainable)
         lost = f" ({row.metrics['lost_episodes']} lost)" if row.metrics["lost_episodes"] else ""
         cells = [plain(row.diagnoser) + (" *" if clairvoyant(row) else "") + lost, *(COLUMNS[c][1](line) for c in columns)]
         found = row.metrics["identification"]

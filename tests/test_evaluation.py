@@ -200,6 +200,22 @@ def test_no_committed_row_beats_a_ceiling():
                     assert drawn.difference(name, above)[1] <= 0, (board.suite.name, kind, name, above)
 
 
+def test_what_is_attained_is_counted_from_chance_between_the_best_and_the_ceiling():
+    board = leaderboard.read_board(ROOT / "leaderboards" / "results" / "b747-standard")
+    score = {row.diagnoser: row.metrics["per_sample"]["balanced_accuracy"] for row in board.rows}
+    best, top = board.best().diagnoser, max(score[row.diagnoser] for row in board.rows if tables.ceiling(row))
+    assert board.attainable() == [score[best], top]
+    shown = {
+        row.diagnoser: tables.COLUMNS["attained"][1](tables.Line(row, None, False, board.attainable())) for row in board.rows
+    }
+    assert shown["null"] == "0-0"  # one label of five is chance
+    assert shown[best] == f"{100 * (score[best] - 0.2) / (top - 0.2):.0f}-100"
+    assert shown["glr_ekf"] == "-".join(f"{100 * (score['glr_ekf'] - 0.2) / (b - 0.2):.0f}" for b in (top, score[best]))
+    assert {shown[row.diagnoser] for row in board.rows if tables.ceiling(row)} == {"-"}
+    row = next(row for row in board.rows if row.diagnoser == best)
+    assert tables.COLUMNS["attained"][1](tables.Line(row, None, False, ())) == "-"
+
+
 def test_a_page_is_rendered_from_the_rows_that_are_there(small, found, tmp_path, monkeypatch):
     monkeypatch.setattr(suite, "SUITES", small.parent)
     assert leaderboard.render(tmp_path) == {"README.md": leaderboard.INTRODUCTION}

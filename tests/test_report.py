@@ -69,7 +69,7 @@ def test_the_table_says_what_the_rows_say(board, page):
     assert [m["name"] for m in data["methods"][:1]] == [board.best().diagnoser]
     for method in data["methods"]:
         row = next(row for row in board.rows if row.diagnoser == method["name"])
-        line = tables.Line(row, 1.5, method["cells"][keys.index("tied")] == "=")
+        line = tables.Line(row, 1.5, method["cells"][keys.index("tied")] == "=", board.attainable())
         assert method["cells"] == [tables.COLUMNS[key][1](line) for key in keys]
         assert method["confusion"]["per_decision"] == row.metrics["per_decision"]["confusion"]
 

@@ -11,7 +11,7 @@ from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
 from fdi_gym.estimation.decision import Reading
 from fdi_gym.estimation.sensor_checks import MEMORY, REPEATED, SensorChecks
-from fdi_gym.faults import draw
+from fdi_gym.faults import Abrupt, Fault, Ramp, draw
 from fdi_gym.sensors import KINDS, of_kind, sensor_mode
 from fdi_gym.testing import check_diagnoser
 
@@ -77,6 +77,20 @@ def test_the_ceiling_names_nearly_all():
     told = make_diagnoser("told_onset_bank", sick(), process="mixed", scenarios=[s for some, _ in flights for s in some])
     true = np.concatenate([record.label[:5, -1] for _, record in flights])
     assert (run(told, shown).label[:, -1] == true).mean() > 0.9
+
+
+def test_a_heading_that_drifts_is_not_taken_for_a_yaw_gyro_with_a_bias():
+    """Both make heading and yaw rate disagree in the same way; only a bias of the gyro begins at once."""
+    plant = build("HUAVHover", sensor_faults=True)
+    scenarios = []
+    for i, (sensor, effect) in enumerate([("psi", Ramp("bias_psi", 0.2, 4.0)), ("r", Abrupt("bias_r", 0.05))] * 2):
+        drawn = draw(plant.process("quiet"), FIRST + i)
+        fault = Fault(sensor_mode(sensor), "bias", 300, [effect])
+        scenarios.append(drawn.replace(steps=min(drawn.steps, 700), faults=[fault]))
+    record = simulate(plant, scenarios)
+    told = make_diagnoser("told_source_oracle", plant, process="mixed", scenarios=scenarios)
+    names = [plant.labels[label].name for label in run(told, record.obs).label[range(4), record.length]]
+    assert names == [sensor_mode("psi"), sensor_mode("r")] * 2
 
 
 @pytest.mark.parametrize("kind", ["drift", "freeze", "plant"])

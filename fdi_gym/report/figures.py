@@ -43,7 +43,7 @@ def figures(board: Board) -> dict[str, Any]:
 
 def _method(board: Board, row: Row, columns: Sequence[str], tied: bool) -> dict[str, Any]:
     entry, outcomes = diagnosers().get(row.diagnoser), board.outcomes[row.diagnoser]
-    line = tables.Line(row, board.times.get(row.diagnoser), tied)
+    line = tables.Line(row, board.times.get(row.diagnoser), tied, board.attainable())
     labels, dt = len(board.plant.labels), board.plant.dt
     return {
         "name": row.diagnoser,

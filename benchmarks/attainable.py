@@ -1,0 +1,121 @@
+"""What a method can attain that is told nothing of the truth: Bayes' rule over the process, refined until it stands still.
+
+    python benchmarks/attainable.py [SUITE ...] [--flights 100] [--page leaderboards/attainable.md]
+    python benchmarks/attainable.py --page-only
+
+The suites named are flown with fresh seeds; sections of others that the page has stay there. The table of all suites is
+made of the rows in leaderboards/results.
+"""
+
+import argparse
+import os
+import time
+from pathlib import Path
+
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ[name] = "1"
+
+import msgspec
+from sensors import sections_of, write_sections
+
+from fdi_gym.diagnosis import make_diagnoser, run
+from fdi_gym.leaderboard import boards
+from fdi_gym.metrics import outcome
+from fdi_gym.scores import summarise
+from fdi_gym.suite import ActingSuite, load_suite
+from fdi_gym.tables import ceiling, markdown
+
+FIRST = 5_000_000  # fresh seeds: neither test nor validation nor training flights
+BANK = "onset_bank"
+SETTINGS = [
+    {"onsets": 2, "courses": 1}, {"onsets": 3, "courses": 2}, {},
+    {"onsets": 12}, {"courses": 6}, {"sizes": 2}, {"every": 2},
+]  # fmt: skip
+SUITES = ("b747-standard", "b747-hard", "tank-standard", "missile-standard")
+INTRODUCTION = """# What can be attained
+
+Written by `python benchmarks/attainable.py --page leaderboards/attainable.md`. A ceiling is told when faults begin; no
+method is. What a method could reach that is told nothing but the process lies between the best such method on the board and
+the ceiling. `onset_bank` is meant to close that bracket from below: Bayes' rule over all that the process leaves open. It
+is exact where the model is linear, sizes are Gaussian and every onset is kept; the sections below show on fresh flights how
+little its score moves as that is refined. Where another method is better than it (`=`: cannot be told from it) it has not
+converged, or cannot run: faults that overlap, and sensors that fail in ways that are no line in theta.
+"""
+
+
+def score(suite, scenarios, record, **settings):
+    """Balanced accuracy per sample and per decision, log score, and the time [us] per sample."""
+    plant = suite.build()
+    method, begun = make_diagnoser(BANK, plant, process=suite.process, **settings), time.process_time()
+    said = run(method, record.obs)
+    spent = time.process_time() - begun
+    scoring = plant.process(suite.process).scoring
+    outcomes = [outcome(plant, scoring, record, said, i) for i in range(len(scenarios))]
+    found = summarise(outcomes, len(plant.labels), [s.name for s in plant.estimated], plant.dt)
+    return found, 1e6 * spent / record.length.sum()
+
+
+def refined(name, count):
+    """A row for each setting: of fresh flights of a suite's kind."""
+    suite = load_suite(name)
+    fresh = msgspec.structs.replace(suite, seeds=[FIRST + i for i in range(count * suite.windows)], healthy=[])
+    plant = suite.build()
+    episodes = range(fresh.episodes)
+    record = fresh.record(plant, episodes)
+    scenarios = fresh.scenarios(plant, episodes)
+    for settings in SETTINGS:
+        found, spent = score(suite, scenarios, record, **settings)
+        told = ", ".join(f"{key} {value}" for key, value in settings.items()) or "as it is"
+        yield [told, *(f"{100 * found[kind]['balanced_accuracy']:.1f}" for kind in ("per_sample", "per_decision")),
+               f"{found['log_score']:.3f}", f"{spent:.0f}"]  # fmt: skip
+
+
+def brackets(results):
+    """A row for each suite that has a ceiling: the best without the bank, the bank, the ceiling."""
+    for board in boards(results):
+        above = [row for row in board.rows if ceiling(row)]
+        if isinstance(board.suite, ActingSuite) or not above:
+            continue
+
+        def of(row):
+            return row.metrics["per_sample"]["balanced_accuracy"]
+
+        others = sorted((row for row in board.honest() if row.diagnoser != BANK), key=of)
+        bank = next((row for row in board.rows if row.diagnoser == BANK), None)
+        if not others:
+            continue
+        top, best = max(above, key=of), others[-1]
+        low = max(of(best), of(bank) if bank else 0.0)
+        yield [f"[{board.suite.name}]({board.suite.name}.md)", f"{best.diagnoser} {100 * of(best):.1f}",
+               f"{100 * of(bank):.1f}" if bank else "-", f"{top.diagnoser} {100 * of(top):.1f}",
+               f"{100 * (of(top) - of(best)):.1f}", f"{100 * max(of(top) - low, 0.0):.1f}"]  # fmt: skip
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("suites", nargs="*", default=SUITES)
+    parser.add_argument("--flights", type=int, default=100)
+    parser.add_argument("--results", type=Path, default=Path("leaderboards/results"))
+    parser.add_argument("--page", type=Path, default=Path("leaderboards/attainable.md"))
+    parser.add_argument("--page-only", action="store_true", help="measure nothing: the table of all suites anew")
+    arguments = parser.parse_args()
+    head = ["suite", "best without it, per sample %", BANK, "ceiling", "bracket before", "and with it"]
+    sections = {name: text for name, text in sections_of(arguments.page).items() if name != "All suites"}
+
+    def write():
+        table = markdown(head, list(brackets(arguments.results)))
+        write_sections(arguments.page, INTRODUCTION, {"All suites": table, **sections})
+
+    for name in () if arguments.page_only else arguments.suites:
+        rows = []
+        for row in refined(name, arguments.flights):
+            rows.append(row)
+            print(name, *row, sep="  ", flush=True)
+        table = markdown(["settings", "per sample %", "per decision %", "log score", "us/sample"], rows)
+        sections[name] = f"{arguments.flights} fresh flights.\n\n{table}"
+        write()
+    write()
+
+
+if __name__ == "__main__":
+    main()
