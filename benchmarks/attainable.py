@@ -28,8 +28,7 @@ from fdi_gym.tables import ceiling, markdown
 FIRST = 5_000_000  # fresh seeds: neither test nor validation nor training flights
 BANK = "onset_bank"
 SETTINGS = [
-    {"onsets": 2, "courses": 1}, {"onsets": 3, "courses": 2}, {},
-    {"onsets": 12}, {"courses": 6}, {"sizes": 2}, {"every": 2},
+    {"onsets": 2, "courses": 1}, {"onsets": 3}, {}, {"onsets": 8}, {"courses": 4}, {"sizes": 2}, {"every": 2},
 ]  # fmt: skip
 SUITES = ("b747-standard", "b747-hard", "tank-standard", "missile-standard")
 INTRODUCTION = """# What can be attained

@@ -15,7 +15,7 @@ from fdi_gym.simultaneous import with_simultaneous
 from fdi_gym.unseen import with_unseen
 
 FEEDBACK = ("faulty", "healthy")
-LASTING = ("sensor_faults", "unseen", "simultaneous", "feedback", "delays")  # what a method may know
+LASTING = ("sensor_faults", "sensor_severity", "unseen", "simultaneous", "feedback", "delays")  # what a method may know
 
 
 class Options(msgspec.Struct, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
@@ -23,6 +23,7 @@ class Options(msgspec.Struct, kw_only=True, omit_defaults=True, forbid_unknown_f
 
     Args:
         sensor_faults: Its sensors may fail (`fdi_gym.sensors`).
+        sensor_severity: Factor on the sizes of their faults that the processes draw, from 0.01 to 1.
         unseen: It meets faults that no method was told of (`fdi_gym.unseen`).
         simultaneous: Any of its faults may act at once (`fdi_gym.simultaneous`).
         feedback: What the controller gets from a sensor that fails: what it says ("faulty"), or what a healthy one would
@@ -31,6 +32,7 @@ class Options(msgspec.Struct, kw_only=True, omit_defaults=True, forbid_unknown_f
     """
 
     sensor_faults: bool = False
+    sensor_severity: float = 1.0
     unseen: bool = False
     simultaneous: bool = False
     feedback: str = "faulty"
@@ -50,14 +52,16 @@ class Options(msgspec.Struct, kw_only=True, omit_defaults=True, forbid_unknown_f
         """The plant with them.
 
         Raises:
-            ValueError: A value that is not allowed, or a sensor that the plant does not have.
+            ValueError: A value that is not allowed or has no effect, or a sensor that the plant does not have.
         """
         self.check_feedback(self.feedback)
         fields = ("dropout", "burst", "periods", "delays", "hold")
         given = msgspec.to_builtins(self)
         sampling = msgspec.convert({name: getattr(self, name) for name in fields}, Sampling)
         if self.sensor_faults:
-            plant = with_sensor_faults(plant)
+            plant = with_sensor_faults(plant, self.sensor_severity)
+        elif self.sensor_severity != 1.0:
+            raise ValueError("sensor_severity is that of sensor_faults, which are not asked for")
         if self.unseen:
             plant = with_unseen(plant)
         if self.simultaneous:

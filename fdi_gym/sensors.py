@@ -18,7 +18,8 @@ The reading is the range's ends at most. It feeds back: the controller gets what
 `feedback="healthy"`. The first false reading of a fault is at its onset, sample k, and acts through the command u_k.
 
 Sizes are counted in the sensor's own unit, five standard deviations of its noise or a twentieth of its scale, whichever is
-larger. `dropout`, `burst`, `periods`, `delays` and `hold` are no faults: `fdi_gym.faults.Sampling`.
+larger; `sensor_severity` (1) multiplies all sizes that the processes draw. `dropout`, `burst`, `periods`, `delays` and
+`hold` are no faults: `fdi_gym.faults.Sampling`.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ GAIN = (0.1, 0.4)  # either sign
 NOISE = (2.0, 8.0)
 SPIKES, EVERY = (1.0, 4.0), 0.1  # units, either sign; share of the samples
 BANDS = (1.0, 1.5)  # units
+LEAST_SEVERITY = 0.01
 
 
 def unit(sensor: Signal) -> float:
@@ -112,7 +114,7 @@ class _Reward(NamedTuple):
         return self.plant.identification_reward(error[..., :own]) + self.biases(error[..., own:])  # type: ignore[misc]
 
 
-def _modes(plant: Plant, entries: tuple[Signal, ...]) -> list[FaultMode]:
+def _modes(plant: Plant, entries: tuple[Signal, ...], severity: float) -> list[FaultMode]:
     """The plant's, and one for each sensor: the line of its bias."""
     own, n_y, n = len(plant.theta), len(plant.outputs), len(plant.estimated)
     zeros = (0.0,) * n_y
@@ -130,18 +132,25 @@ def _modes(plant: Plant, entries: tuple[Signal, ...]) -> list[FaultMode]:
         line[n + i] = 1.0
         reach = (entries[n_y + i].low, entries[n_y + i].high)
         what = f"{', '.join(SENSOR_FAULTS)} of the sensor {s.name}, in units of {unit(s):.3g} {s.unit}".rstrip()
-        found.append(FaultMode(sensor_mode(s.name), what, size, BANDS, (0.0,) * (n + n_y), tuple(line), reach))
+        bands = (severity * BANDS[0], severity * BANDS[1])
+        found.append(FaultMode(sensor_mode(s.name), what, size, bands, (0.0,) * (n + n_y), tuple(line), reach))
     return found
 
 
-def with_sensor_faults(plant: Plant) -> Plant:
+def with_sensor_faults(plant: Plant, severity: float = 1.0) -> Plant:
     """The plant whose sensors may fail.
 
+    Args:
+        plant: The plant.
+        severity: Factor on the sizes that the processes draw.
+
     Raises:
-        ValueError: They may already, or an entry, a mode or a label of the plant has a name that they need.
+        ValueError: The severity is none; they may already; an entry, a mode or a label of the plant has a name that they need.
     """
     if plant.bare is not None:
         raise ValueError(f"the sensors of {plant.id} may fail already")
+    if not LEAST_SEVERITY <= severity <= 1.0:
+        raise ValueError(f"sensor_severity is from {LEAST_SEVERITY} to 1, not {severity:g}")
     entries, n_y, own = _entries(plant.outputs), len(plant.outputs), len(plant.theta)
     biases = entries[n_y : 2 * n_y]
     labels = [Label(sensor_mode(s.name), frozenset({sensor_mode(s.name)})) for s in failing(plant)]
@@ -150,10 +159,10 @@ def with_sensor_faults(plant: Plant) -> Plant:
     reward[:count, :count] = plant.isolation_reward
     return dataclasses.replace(
         plant, bare=plant, theta=(*plant.theta, *entries), estimated=(*plant.estimated, *biases),
-        target=_Target(plant, slice(own + n_y, own + 2 * n_y)), modes=tuple(_modes(plant, entries)),
+        target=_Target(plant, slice(own + n_y, own + 2 * n_y)), modes=tuple(_modes(plant, entries, severity)),
         labels=(*plant.labels, *labels), isolation_reward=reward,
         identification_reward=_Reward(plant, squared_error([s.scale for s in biases])),
-        processes={**plant.processes, **{p.name: p for p in sensor_processes(plant)}},
+        processes={**plant.processes, **{p.name: p for p in sensor_processes(plant, severity)}},
     )  # fmt: skip
 
 
@@ -161,7 +170,9 @@ def with_sensor_faults(plant: Plant) -> Plant:
 # What is drawn
 
 
-def sensor_fault(rng: np.random.Generator, sensor: Signal, kind: str, onset: int, end: int, dt: float) -> Fault:
+def sensor_fault(
+    rng: np.random.Generator, sensor: Signal, kind: str, onset: int, end: int, dt: float, severity: float = 1.0
+) -> Fault:
     """One fault of a sensor, its size drawn.
 
     Args:
@@ -171,11 +182,12 @@ def sensor_fault(rng: np.random.Generator, sensor: Signal, kind: str, onset: int
         onset: Its first step.
         end: The step after its last one, or that of the flight.
         dt: Sample time [s].
+        severity: Factor on the size; a frozen reading has none.
 
     Raises:
         ValueError: Unknown kind.
     """
-    size, name = unit(sensor), sensor.name
+    size, name = severity * unit(sensor), sensor.name
     match kind:
         case "bias":
             effect = Abrupt(f"bias_{name}", random_sign(rng) * size * uniform(rng, *BIAS))
@@ -183,11 +195,11 @@ def sensor_fault(rng: np.random.Generator, sensor: Signal, kind: str, onset: int
             value = random_sign(rng) * size * uniform(rng, *BIAS)
             effect = Ramp(f"bias_{name}", value, max(dt, uniform(rng, 0.1, 0.3) * end * dt))
         case "gain":
-            effect = Abrupt(f"gain_{name}", random_sign(rng) * uniform(rng, *GAIN))
+            effect = Abrupt(f"gain_{name}", severity * random_sign(rng) * uniform(rng, *GAIN))
         case "freeze":
             effect = Abrupt(f"frozen_{name}", 1.0)
         case "noise":
-            effect = Abrupt(f"noise_{name}", uniform(rng, *NOISE))
+            effect = Abrupt(f"noise_{name}", severity * uniform(rng, *NOISE))
         case "spikes":
             count = max(end - onset, 1)
             values = rng.choice([-1.0, 1.0], count) * size * rng.uniform(*SPIKES, count)
@@ -202,6 +214,7 @@ class _Faults(NamedTuple):
 
     plant: Plant
     share: float
+    severity: float
     kinds: tuple[str, ...] = KINDS
 
     def __call__(self, rng: np.random.Generator) -> FaultScenario:
@@ -214,14 +227,14 @@ class _Faults(NamedTuple):
         kind = kinds[int(rng.integers(len(kinds)))]
         steps = scenario.steps
         onset = max(1, int(rng.integers(int(FROM * steps), int(TO * steps) + 1)))
-        return scenario.replace(faults=[sensor_fault(rng, sensor, kind, onset, steps, plant.dt)])
+        return scenario.replace(faults=[sensor_fault(rng, sensor, kind, onset, steps, plant.dt, self.severity)])
 
 
-def sensor_processes(plant: Plant) -> list[FaultProcess]:
+def sensor_processes(plant: Plant, severity: float = 1.0) -> list[FaultProcess]:
     """What a plant whose sensors may fail draws beside its own processes: "mixed" and "sensors"."""
     standard = plant.processes["standard"]
     return [
-        dataclasses.replace(standard, name=name, description=what, sample=_Faults(plant, share))
+        dataclasses.replace(standard, name=name, description=what, sample=_Faults(plant, share, severity))
         for name, share, what in (
             ("mixed", 0.5, "the standard flights, half of the faulty ones with a sensor's fault in place of the plant's"),
             ("sensors", 1.0, "the standard flights, the faulty ones with a sensor's fault in place of the plant's"),
@@ -231,9 +244,9 @@ def sensor_processes(plant: Plant) -> list[FaultProcess]:
 
 def of_kind(plant: Plant, kind: str) -> FaultProcess:
     """The process "sensors" with one kind of fault: for tables by kind."""
-    bare = plant if plant.bare is None else plant.bare
+    bare, severity = plant if plant.bare is None else plant.bare, float(plant.options.get("sensor_severity", 1.0))
     process = sensor_processes(bare)[1]
-    return dataclasses.replace(process, name=f"sensors-{kind}", sample=_Faults(bare, 1.0, (kind,)))
+    return dataclasses.replace(process, name=f"sensors-{kind}", sample=_Faults(bare, 1.0, severity, (kind,)))
 
 
 # ---------------------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import PLANTS, build
 from gymnasium.utils.env_checker import check_env
+from numpy.testing import assert_allclose
 
 from fdi_gym import closed_loop
 from fdi_gym.discovery import load_plant
@@ -313,6 +314,39 @@ def test_sizes_are_counted_in_the_sensors_own_unit(kind, open_loop):
         assert (values != 0).mean() == pytest.approx(0.1, abs=0.01)
     drawn = draw(of_kind(open_loop, kind), 0)
     assert {f.kind for f in drawn.faults} <= {kind}
+
+
+def test_severity_multiplies_what_is_drawn_and_nothing_else():
+    whole, mild = build("B747Lateral", sensor_faults=True), build("B747Lateral", sensor_faults=True, sensor_severity=0.25)
+    met = set()
+    for seed in range(150):
+        for a, b in zip(draw(whole.process("mixed"), seed).faults, draw(mild.process("mixed"), seed).faults, strict=True):
+            assert (a.mode, a.kind, a.onset, a.end) == (b.mode, b.kind, b.onset, b.end)
+            if a.mode in whole.bare.mode_names or a.kind == "freeze":
+                assert a == b
+                continue
+            met.add(a.kind)
+            for one, other in zip(a.effects, b.effects, strict=True):
+                values = (one.values, other.values) if a.kind == "spikes" else (one.value, other.value)
+                assert_allclose(values[1], 0.25 * np.array(values[0]))
+    assert met == set(KINDS) - {"freeze"}
+    mode, soft = (next(m for m in plant.modes if m.name == sensor_mode("phi")) for plant in (whole, mild))
+    assert_allclose(soft.bands, 0.25 * np.array(mode.bands))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sensor_faults": True, "sensor_severity": 0.0}, "from 0.01 to 1, not 0"),
+        ({"sensor_faults": True, "sensor_severity": 2.0}, "from 0.01 to 1, not 2"),
+        ({"sensor_faults": True, "sensor_severity": float("nan")}, "from 0.01 to 1, not nan"),
+        ({"sensor_faults": True, "sensor_severity": "mild"}, "sensor_severity"),
+        ({"sensor_severity": 0.5}, "which are not asked for"),
+    ],
+)
+def test_a_severity_that_is_none_or_of_nothing_is_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        build("B747Lateral", **options)
 
 
 # ---------------------------------------------------------------------------------------------------------------

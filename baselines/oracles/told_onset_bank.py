@@ -30,7 +30,7 @@ from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant
 from fdi_gym.sensors import GAIN, failing, sensor_mode
 
-GROWN = (3.0, 8.0)  # standard deviations of a noise that has grown, in units of the healthy one
+GROWN = (2.0, 7.0)  # by how many healthy standard deviations a noise has grown
 RISES = (0.13, 0.2, 0.27)  # how long a drift goes on, as shares of the flight
 
 
@@ -59,7 +59,7 @@ def rows(plant: Plant, belief: Belief) -> Rows:
         R = np.tile(belief.R, (len(labels), 1, 1))
         return Rows(model, labels, b.m0, b.M0, R, np.zeros(len(labels)), np.zeros(len(labels)))
     offset, direction = model.lines
-    sensors = [s.name for s in failing(plant)]
+    sensors, severity = [s.name for s in failing(plant)], float(plant.options.get("sensor_severity", 1.0))
     entries = [plant.theta_entries.index(f"gain_{name}") for name in sensors]
     count, kinds = len(sensors), 1 + len(GROWN) + len(RISES)
     of = np.array([plant.label_of(frozenset({sensor_mode(name)})) for name in sensors])
@@ -75,10 +75,10 @@ def rows(plant: Plant, belief: Belief) -> Rows:
     heard = {plant.outputs[i].name: column for column, i in enumerate(belief.sensors)}
     for i, name in enumerate(sensors):
         first = len(labels) + kinds * i
-        wide[first, offset.shape[1] + i, 0], M0[first, 0, 0] = 1.0, GAIN[1] ** 2 / 3
+        wide[first, offset.shape[1] + i, 0], M0[first, 0, 0] = 1.0, (severity * GAIN[1]) ** 2 / 3
         noisy, drifts = slice(first + 1, first + 1 + len(GROWN)), slice(first + 1 + len(GROWN), first + kinds)
         if name in heard:
-            R[noisy, heard[name], heard[name]] *= np.square(GROWN)
+            R[noisy, heard[name], heard[name]] *= (1.0 + severity * np.array(GROWN)) ** 2
         wide[drifts, : offset.shape[1]], m0[drifts], M0[drifts] = direction[of[i]], b.m0[of[i]], b.M0[of[i]]
         Q[drifts], rise[drifts] = model.Q[of[i]], RISES
         share[noisy], share[drifts] = 1 / len(GROWN), 1 / len(RISES)

@@ -150,7 +150,7 @@ def _parameters(plant: Plant, scenarios: Sequence[FaultScenario]) -> tuple[Array
     return (which, spread) if spread.shape[1] <= MANY else (which[:0], np.zeros((0, 0)))
 
 
-def events_of(plant: Plant, scenarios: Sequence[FaultScenario], *, courses: int = 3, sizes: int = 1) -> Events:
+def events_of(plant: Plant, scenarios: Sequence[FaultScenario], *, courses: int = 2, sizes: int = 1) -> Events:
     """The events of a process, from scenarios that it drew.
 
     Args:
