@@ -18,7 +18,7 @@ import numpy as np
 from fdi_gym.acting import Acting
 from fdi_gym.checks import check_declaration, check_scenario, twice
 from fdi_gym.data_sheet import FaultMode, Kernels, Label, Signal, squared_error
-from fdi_gym.faults import FaultProcess, FaultScenario
+from fdi_gym.faults import FaultProcess, FaultScenario, draw
 from fdi_gym.model import Array
 from fdi_gym.model import NotApplicableError as NotApplicableError
 from fdi_gym.names import unknown
@@ -306,6 +306,24 @@ class Plant(Truth):
             option = BROUGHT.get(name)
             raise ValueError(f"{found}; {name} comes with {option}=True") if option else found
         return self.processes[name]
+
+    def draw(self, process: str, seed: int, mismatch: float | None = None) -> FaultScenario:
+        """The scenario of one episode, from its seed alone.
+
+        Args:
+            process: Name of the fault process.
+            seed: The episode's seed, as given to `reset`.
+            mismatch: Level at which the truth's physical parameters are drawn; None for what the process prescribes.
+
+        Raises:
+            ValueError: There is no such process; `NotApplicableError` for a mismatch where the plant declares none.
+        """
+        found, perturb = self.process(process), self.perturb
+        if mismatch is None:
+            return draw(found, seed)
+        if perturb is None:
+            raise NotApplicableError(f"{self.id} declares no mismatch")
+        return draw(found, seed, lambda rng: perturb(rng, mismatch))
 
     def describe(self) -> str:
         """The data sheet as text: spaces, bounds, units, fault modes, labels, processes."""

@@ -18,7 +18,7 @@ from gymnasium.spaces import Box
 from fdi_gym.declaration import true_declaration
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
-from fdi_gym.faults import FaultScenario, draw
+from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, Plant, Signal
 from fdi_gym.tasks import TASKS
 
@@ -207,10 +207,7 @@ class Rules:
         """The scenario of an episode: replayed as it is where one was given, else drawn from the seed."""
         if self.scenario is not None:
             return self.scenario
-        return draw(self.plant.process(self.process), seed, None if self.mismatch is None else self._perturb)
-
-    def _perturb(self, rng: np.random.Generator) -> Mapping[str, Any]:
-        return self.plant.perturb(rng, self.mismatch)  # type: ignore[misc,arg-type]
+        return self.plant.draw(self.process, seed, self.mismatch)
 
     def show(self, obs: Array) -> Array:
         """An observation in the units that were asked for; always a new array."""

@@ -145,7 +145,7 @@ def with_sensor_faults(plant: Plant, severity: float = 1.0) -> Plant:
         severity: Factor on the sizes that the processes draw.
 
     Raises:
-        ValueError: The severity is none; they may already; an entry, a mode or a label of the plant has a name that they need.
+        ValueError: The severity is none; they may already; an entry, a mode or a label has a name that they need.
     """
     if plant.bare is not None:
         raise ValueError(f"the sensors of {plant.id} may fail already")

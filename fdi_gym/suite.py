@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Literal, get_type_hints
@@ -22,7 +22,7 @@ from fdi_gym.acts import acting_of
 from fdi_gym.diagnosis import find_diagnoser, probers
 from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.engine import Record, simulate
-from fdi_gym.faults import MAX_STEPS, FaultScenario, draw
+from fdi_gym.faults import MAX_STEPS, FaultScenario
 from fdi_gym.files import RefusedError, digest, pretty, read_json, write_whole
 from fdi_gym.names import blame, check_diagnoser_name, check_name, find_function, find_module, unknown
 from fdi_gym.options import Options
@@ -219,13 +219,10 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     def scenarios(self, plant: Plant, episodes: Sequence[int]) -> list[FaultScenario]:
         """The scenarios of these flights (0, 1, ...). Of one seed: that of `reset(seed=seed)`."""
-        process, perturb = plant.process(self.process), None
-        if self.mismatch is not None:
-            drawn: Callable[..., Mapping[str, Any]] = plant.perturb  # type: ignore[assignment]
-            perturb = lambda rng: drawn(rng, self.mismatch)  # noqa: E731
         seeds, w, found = [*self.seeds, *self.healthy], self.windows, []
         for i in episodes:
-            scenario = chained([draw(process, seed, perturb) for seed in seeds[i * w : (i + 1) * w]], self.pace)
+            drawn = [plant.draw(self.process, seed, self.mismatch) for seed in seeds[i * w : (i + 1) * w]]
+            scenario = chained(drawn, self.pace)
             scenario = scenario if i * w < len(self.seeds) else scenario.without_faults()
             found.append(scenario if self.steps is None else scenario.replace(steps=min(scenario.steps, self.steps)))
         return found

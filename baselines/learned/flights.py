@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from fdi_gym.discovery import load_plant
 from fdi_gym.engine import Record, simulate
 from fdi_gym.faults import draw
 from fdi_gym.metrics import scored_samples
-from fdi_gym.plant import Array, NotApplicableError, Plant
+from fdi_gym.plant import Array, Plant
 from fdi_gym.scores import balanced_accuracy
 
 # the first seed of each split, which ends where the next begins
@@ -52,17 +52,7 @@ def fly(plant: Plant, condition: Condition, seeds: Sequence[int]) -> Record:
     Raises:
         NotApplicableError: The plant has no mismatch, and the condition has.
     """
-    process = plant.process(condition.process)
-    if not condition.mismatch:
-        return simulate(plant, [draw(process, seed) for seed in seeds])
-    drawn = plant.perturb
-    if drawn is None:
-        raise NotApplicableError(f"{plant.id} has no mismatch")
-
-    def perturb(rng: np.random.Generator) -> Mapping[str, Any]:
-        return drawn(rng, condition.mismatch)
-
-    return simulate(plant, [draw(process, seed, perturb) for seed in seeds])
+    return simulate(plant, [plant.draw(condition.process, seed, condition.mismatch or None) for seed in seeds])
 
 
 def identified(plants: Sequence[Plant], shape: FeatureShape, records: Sequence[Record]) -> FeatureModel:

@@ -138,34 +138,48 @@ def told_bank(
         course: (n, K + 1) by which the hypotheses' lines are scaled at each sample; None: they keep their lengths.
         allowed: (n, K + 1, labels) which labels can be at each sample; None: all.
     """
-    model, z, x, count = r.model, r.model.z, r.model.x, len(r.label)
-    N, m, labels = len(model.scale), r.R.shape[-1], len(plant.labels)
-    assert model.lines is not None
-    offset, direction = model.lines
-    own = offset.shape[1] if plant.bare is None else len(plant.estimated)
-    rise = r.rise * np.array([scenario.steps for scenario in scenarios])[:, None]
-    checks = None if plant.bare is None else SensorChecks(plant)
+    bank = _Told(plant, r, scenarios, course, allowed)
+    rule = by_candidate(lambda reading, label: np.argmax(np.asarray(reading.probs), axis=1), 1)
+    return diagnoser_of(plant, Filter(bank.start, bank.predict, bank.update, bank.read, expect=bank.expect), rule)
 
-    def start(n: int) -> Bank:
-        changes, acts = label_changes(plant, scenarios, n)
+
+class _Told:
+    """The filter's functions."""
+
+    def __init__(
+        self, plant: Plant, r: Rows, scenarios: Sequence[FaultScenario], course: Array | None, allowed: Array | None
+    ):
+        self.plant, self.r, self.scenarios, self.course, self.allowed = plant, r, scenarios, course, allowed
+        assert r.model.lines is not None
+        self.offset, self.direction = r.model.lines
+        self.own = self.offset.shape[1] if plant.bare is None else len(plant.estimated)
+        self.rise = r.rise * np.array([scenario.steps for scenario in scenarios])[:, None]
+        self.checks = None if plant.bare is None else SensorChecks(plant)
+
+    def start(self, n: int) -> Bank:
+        """Healthy, and what n flights are told."""
+        r, model, count = self.r, self.r.model, len(self.r.label)
+        changes, acts = label_changes(self.plant, self.scenarios, n)
         X, P = np.tile(model.X0, (n, count, 1)), np.tile(model.P0, (n, count, 1, 1))
-        every = np.ones((n, labels), bool)
+        every = np.ones((n, len(self.plant.labels)), bool)
         return Bank(
-            X, P, np.zeros((n, count)), changes, acts, np.ones((n, 1)) if course is None else course,
-            every[:, None] if allowed is None else allowed, np.zeros(n, bool), np.zeros(n), np.ones((n, count)), every,
-            np.zeros((n, m)), np.tile(r.R[0], (n, 1, 1)), None if checks is None else checks.start(n), rise,
+            X, P, np.zeros((n, count)), changes, acts, np.ones((n, 1)) if self.course is None else self.course,
+            every[:, None] if self.allowed is None else self.allowed, np.zeros(n, bool), np.zeros(n), np.ones((n, count)),
+            every, np.zeros((n, r.R.shape[-1])), np.tile(r.R[0], (n, 1, 1)),
+            None if self.checks is None else self.checks.start(n), self.rise,
         )  # fmt: skip
 
-    def sized(length: Array) -> AugmentedModel:
+    def sized(self, length: Array) -> AugmentedModel:
         """The model whose lines are as long as what acts is large."""
         if (length == 1.0).all():
-            return model
-        wide = length.reshape(-1, 1)
-        lines = (wide * np.tile(offset, (len(length), 1)), wide[..., None] * np.tile(direction, (len(length), 1, 1)))
-        return model.replace(lines=lines)
+            return self.r.model
+        wide, n = length.reshape(-1, 1), len(length)
+        lines = (wide * np.tile(self.offset, (n, 1)), wide[..., None] * np.tile(self.direction, (n, 1, 1)))
+        return self.r.model.replace(lines=lines)
 
-    def predict(s: Bank, at: Interval) -> Bank:
-        n = len(at.k)
+    def predict(self, s: Bank, at: Interval) -> Bank:
+        """Over the interval; at a change of the label all start from what the healthy one knows."""
+        r, z, n = self.r, self.r.model.z, len(at.k)
         each, k = np.arange(n), np.minimum(at.k, s.acts.shape[1] - 1)
         changed, now = s.changes[each, k], s.acts[each, k]
         since = np.where(changed, 1.0, s.since + 1.0)
@@ -177,43 +191,51 @@ def told_bank(
         P[changed, :, z, :] = 0.0
         P[changed, :, :, z] = 0.0
         P[..., z, z] = np.where(changed[:, None, None, None], r.M0, P[..., z, z])
-        X1, P1 = sized(length).predict("extended", X.reshape(-1, N), P.reshape(-1, N, N), at)
+        N = X.shape[-1]
+        X1, P1 = self.sized(length).predict("extended", X.reshape(-1, N), P.reshape(-1, N, N), at)
         among = s.allowed[each, np.minimum(k, s.allowed.shape[1] - 1)]
-        X1, P1 = X1.reshape(n, count, N), P1.reshape(n, count, N, N)
+        X1, P1 = X1.reshape(X.shape), P1.reshape(P.shape)
         return s._replace(X=X1, P=P1, log=log, now=now, since=since, length=length, among=among)
 
-    def update(s: Bank, at: Interval, y: Array, seen: Array) -> Bank:
-        n = len(s.now)
-        done = sized(s.length).update("extended", s.X.reshape(-1, N), s.P.reshape(-1, N, N), at, y, seen, r.R)
+    def update(self, s: Bank, at: Interval, y: Array, seen: Array) -> Bank:
+        """Weigh and correct all."""
+        n, count, N = s.X.shape
+        done = self.sized(s.length).update("extended", s.X.reshape(-1, N), s.P.reshape(-1, N, N), at, y, seen, self.r.R)
+        m = done.nu.shape[-1]
         found = s._replace(
-            X=done.X.reshape(n, count, N), P=done.P.reshape(n, count, N, N), nu=done.nu.reshape(n, count, m)[:, 0],
+            X=done.X.reshape(s.X.shape), P=done.P.reshape(s.P.shape), nu=done.nu.reshape(n, count, m)[:, 0],
             S=done.S.reshape(n, count, m, m)[:, 0], log=s.log + done.log_likelihood.reshape(n, count),
         )  # fmt: skip
-        if checks is None or s.checks is None:
+        if self.checks is None or s.checks is None:
             return found
-        return found._replace(checks=checks.update(s.checks, y, seen, Reading(nu=found.nu, S=found.S)))
+        return found._replace(checks=self.checks.update(s.checks, y, seen, Reading(nu=found.nu, S=found.S)))
 
-    def read(s: Bank) -> Reading:
-        n = len(s.now)
-        log = s.log + r.log_prior
-        by_label = np.full((n, labels), -np.inf)
+    def by_label(self, s: Bank, log: Array) -> Array:
+        """Log likelihood (n, labels) of each label that can be, on average over its hypotheses."""
+        n, labels = len(s.now), len(self.plant.labels)
+        found = np.full((n, labels), -np.inf)
         for label in range(1, labels):
-            by_label[:, label] = logsumexp(log[:, r.label == label], axis=1)
-        if checks is not None and s.checks is not None:
-            gain = checks.repeated(s.checks)
-            least = s.log[:, :1] if allowed is None else s.log.max(axis=1, keepdims=True)  # the reading itself was certain
-            by_label = np.where(gain > 0, np.maximum(by_label, least + 0.5 * gain), by_label)
-        by_label[~s.among] = -np.inf
-        by_label[~s.now] = -np.inf
-        by_label[~s.now, 0] = 0.0
+            found[:, label] = logsumexp(log[:, self.r.label == label], axis=1)
+        if self.checks is not None and s.checks is not None:
+            gain = self.checks.repeated(s.checks)
+            least = s.log[:, :1] if self.allowed is None else s.log.max(axis=1, keepdims=True)  # the reading was certain
+            found = np.where(gain > 0, np.maximum(found, least + 0.5 * gain), found)
+        found[~s.among] = -np.inf
+        found[~s.now] = -np.inf
+        found[~s.now, 0] = 0.0
+        return found
+
+    def read(self, s: Bank) -> Reading:
+        """Probabilities of the labels, and the mean of the fault vector."""
+        model, log = self.r.model, s.log + self.r.log_prior
+        by_label = self.by_label(s, log)
         probs = np.exp(by_label - logsumexp(by_label, axis=1, keepdims=True))
         weight = np.exp(log - logsumexp(log[:, 1:], axis=1, keepdims=True)) * s.now[:, None]
         weight[:, 0] = 0.0
-        deviation = s.length[..., None] * (offset + (direction @ s.X[..., z, None])[..., 0])
-        mean = (weight[..., None] * deviation).sum(axis=1)[:, :own]
-        return Reading(mean, x=s.X[:, 0, x], nu=s.nu, S=s.S, probs=probs)
+        deviation = s.length[..., None] * (self.offset + (self.direction @ s.X[..., model.z, None])[..., 0])
+        mean = (weight[..., None] * deviation).sum(axis=1)[:, : self.own]
+        return Reading(mean, x=s.X[:, 0, model.x], nu=s.nu, S=s.S, probs=probs)
 
-    rule = by_candidate(lambda reading, label: np.argmax(np.asarray(reading.probs), axis=1), 1)
-    return diagnoser_of(
-        plant, Filter(start, predict, update, read, expect=lambda s, at: model.expect(s.X[:, 0, x], at)), rule
-    )
+    def expect(self, s: Bank, at: Interval) -> Array:
+        """What the healthy filter expects the sensors to read."""
+        return self.r.model.expect(s.X[:, 0, self.r.model.x], at)
