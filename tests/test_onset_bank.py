@@ -13,6 +13,7 @@ from fdi_gym.diagnosis.filtering import readings
 from fdi_gym.diagnosis.fitting import fit_belief
 from fdi_gym.engine import simulate
 from fdi_gym.estimation import gaussian
+from fdi_gym.estimation.augmented import augmented, on_lines
 from fdi_gym.estimation.events import RISES, SATURATES, events_of
 from fdi_gym.estimation.interval import Interval
 from fdi_gym.faults import Abrupt, Fault, FaultScenario, Hold, Incipient, Intermittent, Ramp, Samples, draw
@@ -133,6 +134,22 @@ def test_an_entry_beyond_theta_is_a_physical_parameter():
     assert_allclose(found[:, :n_x], plant.propagate(np.zeros(4), x, u, None, d, p), rtol=1e-12)
     assert not np.allclose(found[:, :n_x], plant.propagate(np.zeros(4), x, u, None, d), rtol=1e-9)
     assert_allclose(found[:, n_x], m)
+
+
+def test_other_lines_are_those_of_a_model_that_is_bound_anew():
+    plant = build("ThreeTank")
+    base = augmented(plant, fit_belief(plant, "standard"))
+    rng = np.random.default_rng(4)
+    p = len(base.inputs.entries)
+    one, other = ((rng.standard_normal((r, p)), rng.standard_normal((r, p, 2))) for r in (1, 3))
+    model = on_lines(base, *one, np.zeros((1, 2)), 1.0)
+    N = len(model.scale)
+    X, P = np.tile(model.X0, (6, 1)) + 0.01, np.tile(1e-4 * np.eye(N), (6, 1, 1))
+    at = Interval(np.ones(6, int), np.tile(plant.trim_command, (6, 1)), None, np.zeros((6, len(plant.known))))
+    found, expected = (m.predict("extended", X, P, at) for m in (model.on(*other), model.replace(lines=other)))
+    for a, b in zip(found, expected, strict=True):
+        assert np.array_equal(a, b)
+    assert not np.array_equal(found[0], model.predict("extended", X, P, at)[0])
 
 
 def test_a_mixture_has_the_mean_and_covariance_of_its_parts():

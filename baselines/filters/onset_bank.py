@@ -116,7 +116,7 @@ class Bank:
 
     def sized(self, s: Onsets) -> AugmentedModel:
         """The model with these lines."""
-        return self.model.replace(lines=self.lines(s))
+        return self.model.on(*self.lines(s))
 
     def ended(self, s: Onsets, step: Array) -> Onsets:
         """The weight of events that end within the period before a step goes back to the healthy filter."""

@@ -174,8 +174,7 @@ class _Told:
         if (length == 1.0).all():
             return self.r.model
         wide, n = length.reshape(-1, 1), len(length)
-        lines = (wide * np.tile(self.offset, (n, 1)), wide[..., None] * np.tile(self.direction, (n, 1, 1)))
-        return self.r.model.replace(lines=lines)
+        return self.r.model.on(wide * np.tile(self.offset, (n, 1)), wide[..., None] * np.tile(self.direction, (n, 1, 1)))
 
     def predict(self, s: Bank, at: Interval) -> Bank:
         """Over the interval; at a change of the label all start from what the healthy one knows."""

@@ -19,6 +19,7 @@ from fdi_gym.estimation import gaussian
 from fdi_gym.estimation.belief import Belief, FaultInputs, fault_inputs
 from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.kalman import T
+from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, Plant
 
 NO_TIME = np.zeros(1)  # of what is a matrix: it is the same at all times
@@ -48,6 +49,14 @@ class AugmentedModel:
     def replace(self, **changes: Any) -> AugmentedModel:
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
+
+    def on(self, offset: Array, direction: Array) -> AugmentedModel:
+        """The model of other lines: offsets (r, p) and directions (r, p, f) of as many magnitudes."""
+        found = self.replace(lines=(offset, direction))
+        bound = self.compiled
+        constants = (*bound.constants[:3], contiguous(offset), contiguous(direction))
+        found.__dict__["compiled"] = bound._replace(constants=constants)
+        return found
 
     @property
     def rest(self) -> list[int]:
