@@ -1,5 +1,6 @@
-"""Which network? The same flights, steps and heads for a recurrent, a convolutional and a state-space network, and for
-the recurrent one without the identified model. Validation flights only; accuracy and seconds of one run.
+"""Which network? The same flights, steps and heads for a recurrent network, one that attends to the last steps, a
+convolutional and a state-space one, and for the recurrent one without the identified model. Validation flights only;
+accuracy and seconds of one run.
 
 python benchmarks/architectures.py [--plant B747Lateral] [--flights 512]
 """
@@ -14,6 +15,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from baselines.learned import weights
+from baselines.learned._attention import Attention
 from baselines.learned._network import SequenceNetwork
 from baselines.learned._supervised import SupervisedTraining
 from baselines.learned.recipes import sequence_recipe
@@ -79,6 +81,7 @@ class Candidate(SupervisedTraining):
 
 CANDIDATES = {
     "gated recurrent unit": {},
+    "attention": {"memory": Attention},
     "dilated convolution": {"memory": Convolution},
     "diagonal state space": {"memory": StateSpace},
     "gated recurrent unit, samples only": {"blind": True},

@@ -16,7 +16,7 @@ import torch
 from conftest import PLANTS, build
 from safetensors.numpy import load_file, save_file
 
-from baselines.learned import features, flights, probabilities, recipes, sequence_net, weights
+from baselines.learned import _attention, attention, features, flights, probabilities, recipes, sequence_net, weights
 from baselines.learned._network import SequenceNetwork, loss
 from baselines.learned._supervised import SupervisedTraining
 from baselines.learned.features import FeatureShape
@@ -106,11 +106,12 @@ def test_streamed_diagnoses_are_those_of_the_whole_sequence(path):
     told = flights.filters_features(plant, condition, card.filters, obs, shape.period)
     x = torch.from_numpy(np.concatenate([*seen, *told], axis=2)).double()
     widths = tuple(part.shape[2] for part in told)
-    size = (x.shape[2], len(plant.labels), len(plant.estimated), card.shape["hidden"], widths, len(card.processes))
+    memory = "attention" if card.method == "attention_net" else "recurrent"
+    size = (x.shape[2], len(plant.labels), len(plant.estimated), card.shape["hidden"], widths, len(card.processes), memory)
     net = SequenceNetwork(*size).double()
     net.load_state_dict({name: torch.from_numpy(tensors[f"network.{name}"]) for name in net.state_dict()})
     with torch.inference_mode():
-        logits, mean, log_std, _ = (a.numpy() for a in net(x))
+        logits, mean, log_std = (a.numpy() for a in net(x)[:3])
     said = run(make_diagnoser(path.stem.split("-")[0], plant), obs)
     fitted = card.calibration[card.processes[0]]
     probs = np.exp(probabilities.log_softmax(fitted.scale * logits + np.array(fitted.bias)))
@@ -186,17 +187,20 @@ def test_a_network_that_is_shown_filters_starts_from_one_that_is_not(plant_id, f
     check_diagnoser(lambda p, _: make_diagnoser("residual_net", p, path=str(path)), plant, samples=60)
 
 
+@pytest.mark.parametrize("memory", ["recurrent", "attention"])
 @pytest.mark.parametrize("filters", [(), (4, 6)], ids=["alone", "filters"])
-def test_a_step_on_numpy_is_a_step_of_the_network_that_was_trained(filters):
+def test_a_step_on_numpy_is_a_step_of_the_network_that_was_trained(filters, memory, monkeypatch):
+    monkeypatch.setattr(attention, "WINDOW", 5)  # shorter than what is shown
+    monkeypatch.setattr(_attention, "WINDOW", 5)
     torch.manual_seed(0)
-    net = SequenceNetwork(8 + 2 + sum(filters), 3, 2, 16, filters, processes=2).double()
+    net = SequenceNetwork(8 + 2 + sum(filters), 3, 2, 16, filters, processes=2, memory=memory).double()
     for value in net.parameters():
         value.data.normal_(std=0.7)
     tensors = {name: value.numpy() for name, value in net.state_dict().items()}
     x = np.random.default_rng(0).normal(size=(5, 7, net.value.in_features))
     with torch.inference_mode():
         whole = [a.numpy() for a in net(torch.from_numpy(x))[:3]]
-    h = np.zeros((5, 16))
+    h = attention.begin(5, 16) if memory == "attention" else np.zeros((5, 16))
     for k in range(x.shape[1]):
         *answer, h = sequence_net.forward(tensors, x[:, k], h, 3, 2)
         for a, b in zip(answer, whole, strict=True):

@@ -78,7 +78,7 @@ class SupervisedTraining(Training[SequenceRecipe]):
             found = data.filters_features(p, r.conditions[0], r.filters, obs, r.shape.period)
             widths = tuple(f.shape[-1] for f in found)
         inputs = len(model.mean) + len(r.conditions) + sum(widths)
-        sizes = (inputs, len(p.labels), len(p.estimated), r.hidden, widths, len(r.conditions))
+        sizes = (inputs, len(p.labels), len(p.estimated), r.hidden, widths, len(r.conditions), r.memory)
         self.network = SequenceNetwork(*sizes).to(self.device)
         self.optimiser = torch.optim.AdamW(self.network.parameters(), lr=r.rate, weight_decay=r.decay)
 

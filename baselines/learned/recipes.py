@@ -46,6 +46,7 @@ class SequenceRecipe(Recipe):
         batch: Flights per step of the optimiser.
         decay: Weight decay.
         share: Of the identification task in the loss.
+        memory: Of the network: "recurrent" or "attention".
     """
 
     filters: tuple[str, ...] = ()
@@ -55,6 +56,7 @@ class SequenceRecipe(Recipe):
     batch: int = 32
     decay: float = 1e-2
     share: float = 0.05
+    memory: str = "recurrent"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,6 +158,11 @@ def randomised_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe
     """The recipe of the network that is trained on plants off the model; arguments as in `sequence_recipe`."""
     found = sequence_recipe(plant, budget)
     return replace(found, conditions=tuple(c._replace(mismatch=MISMATCH) for c in found.conditions))
+
+
+def attention_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
+    """The recipe of the network that attends to the last steps; arguments as in `sequence_recipe`."""
+    return replace(sequence_recipe(plant, budget), memory="attention", rate=1e-3)
 
 
 def residual_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:

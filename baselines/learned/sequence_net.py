@@ -1,4 +1,6 @@
-"""A recurrent network over steps of several samples, and one that is shown filters too: trained under supervision.
+"""Networks over steps of several samples, one that is shown filters too: trained under supervision.
+
+Its memory is recurrent, or attends to the last steps (`baselines.learned.attention`).
 
 The network sees what `baselines.learned.features` makes of the samples so far and answers at the end of each step; the
 answer holds until the next. It was trained with labels of equal weight, so its most probable label is the one that balanced
@@ -17,15 +19,19 @@ from typing import Any
 
 import numpy as np
 
+from baselines.learned import attention, weights
 from baselines.learned import features as feat
-from baselines.learned import weights
 from baselines.learned.flights import filter_features
 from baselines.learned.probabilities import log_softmax
-from baselines.learned.recipes import randomised_recipe, residual_recipe, sequence_recipe
+from baselines.learned.recipes import attention_recipe, randomised_recipe, residual_recipe, sequence_recipe
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser, diagnosers, make_diagnoser, trainer
 from fdi_gym.plant import Array, Plant
 
-RECIPES = {"sequence_net": sequence_recipe, "residual_net": residual_recipe, "randomised_net": randomised_recipe}
+ATTENTION = "attention_net"
+RECIPES = {
+    "sequence_net": sequence_recipe, "residual_net": residual_recipe, "randomised_net": randomised_recipe,
+    ATTENTION: attention_recipe,
+}  # fmt: skip
 REACH = 10.0  # trust in filters is learned so many times faster than the rest: it must rise and fall by several logits
 LOG_STD = (-6.0, 3.0)  # bounds of the estimate's log standard deviation
 
@@ -33,12 +39,13 @@ LOG_STD = (-6.0, 3.0)  # bounds of the estimate's log standard deviation
 @diagnoser("sequence_net", "Recurrent network on observations, supervised", sensors=True, method="sequence_net")
 @diagnoser("residual_net", "Recurrent network that is shown filters too, supervised", sensors=True, method="residual_net")
 @diagnoser("randomised_net", "Recurrent network trained on plants off the model", sensors=True, method="randomised_net")
+@diagnoser(ATTENTION, "Network that attends to the last steps, supervised", sensors=True, method=ATTENTION)
 def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "standard", path: str = "") -> Diagnoser:
     """The trained network.
 
     Args:
         plant: A plant that there are weights for.
-        method: Which network: "sequence_net", "residual_net" or "randomised_net".
+        method: Which network: "sequence_net", "residual_net", "randomised_net" or "attention_net".
         process: The fault process that it is told to expect.
         path: Weights of your own; their card lies beside them.
 
@@ -58,7 +65,7 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
     filters = [make_diagnoser(name, plant, process=expected) for name in card.filters]
     trim = np.array([[s.nominal for s in plant.observed]])
     told = sum(filter_features(plant, f.update(f.init(1), trim)[1]).shape[1] for f in filters)
-    weights.check_tensors(file, tensors, tensor_shapes(plant, shape, hidden, told, len(card.processes)))
+    weights.check_tensors(file, tensors, tensor_shapes(plant, shape, hidden, told, len(card.processes), method))
     model = weights.model_of(tensors)
     net = {name.removeprefix("network."): value.astype(float) for name, value in tensors.items()}
     context = np.eye(len(card.processes))[card.processes.index(expected)]
@@ -70,9 +77,10 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
     def init(n: int) -> Any:
         first = Diagnosis(np.zeros(n, bool), np.zeros(n, np.int64), np.tile(healthy, (n, 1)), np.tile(unit, (n, 1)),
                           np.tile(prior / prior.sum(), (n, 1)))  # fmt: skip
-        return 0, feat.begin(plant, shape, n), np.zeros((n, hidden)), [f.init(n) for f in filters], first
+        h = attention.begin(n, hidden) if method == ATTENTION else np.zeros((n, hidden))
+        return 0, feat.begin(plant, shape, n), h, [f.init(n) for f in filters], first
 
-    def answer(x: Array, h: Array) -> tuple[Array, Diagnosis]:
+    def answer(x: Array, h: Any) -> tuple[Any, Diagnosis]:
         logits, mean, log_std, h = forward(net, x, h, len(plant.labels), len(context))
         label = logits.argmax(axis=1)
         probs = np.exp(log_softmax(scale * logits + bias))
@@ -93,6 +101,7 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
 @trainer("sequence_net", "Recurrent network on observations, supervised")
 @trainer("residual_net", "The network that is shown filters too; starts from sequence_net", method="residual_net")
 @trainer("randomised_net", "The network on plants off the model, each flight another", method="randomised_net")
+@trainer(ATTENTION, "The network that attends to the last steps", method=ATTENTION)
 def train_sequence_net(
     plant: Plant, *, budget: int | None = None, seed: int = 0, work: Path = Path("runs"), threads: int = 1,
     method: str = "sequence_net",
@@ -106,7 +115,7 @@ def train_sequence_net(
         work: Folder of runs; one that was killed goes on. "residual_net" starts from the weights of "sequence_net" there,
             or else from those that ship.
         threads: Of torch.
-        method: "sequence_net", "residual_net" or "randomised_net".
+        method: "sequence_net", "residual_net", "randomised_net" or "attention_net".
 
     Raises:
         NotApplicableError: The plant has no mismatch, and randomised_net needs it.
@@ -126,7 +135,7 @@ def train_sequence_net(
 
 
 def tensor_shapes(
-    plant: Plant, shape: feat.FeatureShape, hidden: int, told: int, processes: int
+    plant: Plant, shape: feat.FeatureShape, hidden: int, told: int, processes: int, method: str = "sequence_net"
 ) -> dict[str, tuple[int, ...]]:  # fmt: skip
     """The shapes of all arrays of a stored network, `told` entries by filters: the network's and the model's."""
     model = feat.tensor_shapes(plant, shape)
@@ -137,8 +146,12 @@ def tensor_shapes(
     }  # fmt: skip
     found = {f"network.{name}.weight": size for name, size in layers.items()}
     found |= {f"network.{name}.bias": size[:1] for name, size in layers.items()}
-    for end in ("ih", "hh"):
-        found |= {f"network.memory.weight_{end}_l0": (3 * hidden, hidden), f"network.memory.bias_{end}_l0": (3 * hidden,)}
+    if method == ATTENTION:
+        found |= {f"network.memory.{name}": size for name, size in attention.tensor_shapes(hidden).items()}
+    else:
+        for end in ("ih", "hh"):
+            found[f"network.memory.weight_{end}_l0"] = (3 * hidden, hidden)
+            found[f"network.memory.bias_{end}_l0"] = (3 * hidden,)
     if told:
         found["network.direct.weight"] = (labels, processes * told)
     return found | model
@@ -148,20 +161,28 @@ def _sigmoid(x: Array) -> Array:
     return 0.5 + 0.5 * np.tanh(0.5 * x)
 
 
+def recur(net: Mapping[str, Array], x: Array, h: Array) -> Array:
+    """The memory (n, hidden) of a gated recurrent unit after a step x (n, hidden)."""
+    reset, keep, new = np.split(x @ net["memory.weight_ih_l0"].T + net["memory.bias_ih_l0"], 3, axis=1)
+    reset_h, keep_h, new_h = np.split(h @ net["memory.weight_hh_l0"].T + net["memory.bias_hh_l0"], 3, axis=1)
+    keep = _sigmoid(keep + keep_h)
+    return (1 - keep) * np.tanh(new + _sigmoid(reset + reset_h) * new_h) + keep * h
+
+
 def forward(
-    net: Mapping[str, Array], x: Array, h: Array, labels: int, processes: int
-) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+    net: Mapping[str, Array], x: Array, h: Any, labels: int, processes: int
+) -> tuple[Array, Array, Array, Any]:  # fmt: skip
     """One step of the network that `_network.SequenceNetwork` trains.
 
     Args:
         net: Its tensors.
         x: Features (n, inputs): those of the model, the process (n, processes), and those of filters.
-        h: Memory (n, hidden).
+        h: Memory (n, hidden), or an `attention.Recent`.
         labels: Labels of the plant.
         processes: Fault processes that it knows.
 
     Returns:
-        logits (n, labels), mean and log standard deviation of the deviation (n, n_estimated), memory (n, hidden)
+        logits (n, labels), mean and log standard deviation of the deviation (n, n_estimated), memory
     """
 
     def linear(name: str, a: Array) -> Array:
@@ -170,11 +191,12 @@ def forward(
     product = linear("value", x) * np.tanh(linear("gate", x))
     joined = linear("join", np.concatenate([x, product], axis=1))
     seen = joined * _sigmoid(joined)
-    reset, keep, new = np.split(seen @ net["memory.weight_ih_l0"].T + net["memory.bias_ih_l0"], 3, axis=1)
-    reset_h, keep_h, new_h = np.split(h @ net["memory.weight_hh_l0"].T + net["memory.bias_hh_l0"], 3, axis=1)
-    keep = _sigmoid(keep + keep_h)
-    h = (1 - keep) * np.tanh(new + _sigmoid(reset + reset_h) * new_h) + keep * h
-    read = linear("read", seen + h)
+    if isinstance(h, attention.Recent):
+        own = {name.removeprefix("memory."): value for name, value in net.items() if name.startswith("memory.")}
+        remembered, h = attention.step(own, seen, h)
+    else:
+        remembered = h = recur(net, seen, h)
+    read = linear("read", seen + remembered)
     out = linear("heads", read * _sigmoid(read))
     logits, (mean, log_std) = out[:, :labels], np.split(out[:, labels:], 2, axis=1)
     if "direct.weight" in net:
