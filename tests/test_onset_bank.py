@@ -260,6 +260,21 @@ def test_more_onsets_change_little_and_it_is_the_best_where_faults_come_and_go()
     assert bank > balanced("multiple_model_ekf") + 0.05
 
 
+@pytest.mark.parametrize("process", ["hard", "gust"])
+def test_told_the_onsets_it_is_a_ceiling(process):
+    plant = build("B747Lateral")
+    scenarios = [draw(plant.process(process), FIRST + 20 + i) for i in range(12)]
+    record = simulate(plant, scenarios)
+    told = run(make_diagnoser("told_events_oracle", plant, process=process, scenarios=scenarios), record.obs).label
+    bank = run(make_diagnoser("onset_bank", plant, process=process), record.obs).label
+    valid = np.arange(record.obs.shape[1]) <= record.length[:, None]
+    acts = valid & (record.label > 0)
+    assert ((told > 0) == acts)[valid].all()
+    assert (told == record.label)[acts].mean() > max(0.8, (bank == record.label)[acts].mean())
+    with pytest.raises(ValueError, match="told of 12 flights, not 3"):
+        make_diagnoser("told_events_oracle", plant, process=process, scenarios=scenarios).init(3)
+
+
 def test_held_commands_are_those_at_the_onset():
     plant = build("B747Lateral")
     jam = Fault("rudder stuck", "jam", 300, [Abrupt("gamma_rudder", -1.0), Hold("b_rudder", "rudder")])

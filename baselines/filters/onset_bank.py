@@ -29,11 +29,10 @@ from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.diagnosis.fitting import FLOOR, VALIDATION_SEED
 from fdi_gym.estimation.augmented import AugmentedModel, augmented, on_lines
 from fdi_gym.estimation.belief import Belief, fault_inputs
-from fdi_gym.estimation.decision import Reading, by_candidate
+from fdi_gym.estimation.decision import Reading, Rule, by_candidate
 from fdi_gym.estimation.events import Events, events_of
 from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.mixing import mixture
-from fdi_gym.faults import draw
 from fdi_gym.plant import Array, NotApplicableError, Plant
 
 FIRST, DRAWN = 700_000, 2000  # scenarios from VALIDATION_SEED + FIRST on
@@ -128,16 +127,22 @@ class Bank:
         log_stay = np.where(age > last, -30.0, log_stay).reshape(len(step), -1)
         with np.errstate(divide="ignore"):
             leaving = np.maximum(s.log[:, 1:] + np.log(-np.expm1(log_stay)), NEVER)
-        X, P = s.X.copy(), s.P.copy()
-        X[..., self.m], P[..., self.m, :], P[..., :, self.m] = 0.0, 0.0, 0.0
-        log = np.concatenate([s.log[:, :1], leaving], axis=1)
-        total, mean, covariance = merged(log, X, P)
-        X, P, stayed = s.X.copy(), s.P.copy(), np.exp(s.log[:, 0] - total)
-        X[:, 0], P[:, 0] = mean, covariance
-        log = np.concatenate([total[:, None], np.maximum(s.log[:, 1:] + log_stay, NEVER)], axis=1)
+        healed = self.healed(s, np.concatenate([s.log[:, :1], leaving], axis=1))
+        total = healed.log[:, :1]
+        stayed = np.exp(s.log[:, 0] - total[:, 0])
+        log = np.concatenate([total, np.maximum(s.log[:, 1:] + log_stay, NEVER)], axis=1)
         first, others = s.first * stayed, np.maximum(1.0 - s.first * stayed, 1e-12)
         since = ((1.0 - s.first) * stayed * s.since + (1.0 - stayed) * (step - self.every / 2)) / others
-        return s._replace(X=X, P=P, log=log, first=first, since=since)
+        return healed._replace(log=log, first=first, since=since)
+
+    def healed(self, s: Onsets, log: Array) -> Onsets:
+        """The healthy filter becomes the mixture of all, with these weights (n, 1 + r s), and gets their sum."""
+        X, P = s.X.copy(), s.P.copy()
+        X[..., self.m], P[..., self.m, :], P[..., :, self.m] = 0.0, 0.0, 0.0
+        total, mean, covariance = merged(log, X, P)
+        X, P, weights = s.X.copy(), s.P.copy(), s.log.copy()
+        X[:, 0], P[:, 0], weights[:, 0] = mean, covariance, total
+        return s._replace(X=X, P=P, log=weights)
 
     def begun(self, s: Onsets, step: Array, u: Array) -> Onsets:
         """Each kind of event may have begun at a step: the newest onset; two older ones become one."""
@@ -201,6 +206,10 @@ class Bank:
                 for a, new in zip(whole, part, strict=True):
                     a[turn] = new
                 s = whole
+        return self.moved(s, at)
+
+    def moved(self, s: Onsets, at: Interval) -> Onsets:
+        """All filters, over the interval."""
         age = (at.k[:, None, None] - s.onset) * self.plant.dt
         s = s._replace(length=self.events.at(np.maximum(age, 0.0)), u=at.u)
         N = len(self.model.scale)
@@ -241,6 +250,24 @@ class Bank:
         return self.model.expect(s.X[:, 0, self.model.x], at)
 
 
+def events_of_process(plant: Plant, process: str, courses: int, sizes: int) -> Events:
+    """The events of a fault process, counted in scenarios with validation seeds.
+
+    Raises:
+        NotApplicableError: Sensors may fail too, faults overlap, or one has no course that could be known.
+    """
+    if plant.bare is not None:
+        raise NotApplicableError("sensors that fail by noise, freezing or spikes are no lines in theta")
+    drawn = [plant.draw(process, VALIDATION_SEED + FIRST + i) for i in range(DRAWN)]
+    return events_of(plant, drawn, courses=courses, sizes=sizes)
+
+
+def most_telling(events: Events) -> Rule:
+    """The most probable label in proportion to its share of all samples, at once."""
+    balanced = np.where(events.share > 0, 1.0 / np.maximum(events.share, 1e-12), 0.0)
+    return by_candidate(lambda reading, label: np.argmax(np.asarray(reading.probs) * balanced, axis=1), 1)
+
+
 @diagnoser("onset_bank", "Bayes' rule over onset, kind and size of the process's faults: what can be attained")
 def onset_bank(
     plant: Plant,
@@ -272,13 +299,7 @@ def onset_bank(
             raise ValueError(f"{name} is {least} or more, not {value}")
     if every is not None and every < 1:
         raise ValueError(f"every is a sample or more, not {every}")
-    if plant.bare is not None:
-        raise NotApplicableError("sensors that fail by noise, freezing or spikes are no lines in theta")
-    scenarios = [draw(plant.process(process), VALIDATION_SEED + FIRST + i) for i in range(DRAWN)]
-    events = events_of(plant, scenarios, courses=courses, sizes=sizes)
-    steps = max(s.steps for s in scenarios)
-    bank = Bank(plant, belief, events, onsets, max(1, steps // GRID) if every is None else every)
-    share = events.share
-    balanced = np.where(share > 0, 1.0 / np.maximum(share, 1e-12), 0.0)
-    rule = by_candidate(lambda reading, label: np.argmax(np.asarray(reading.probs) * balanced, axis=1), 1)
-    return diagnoser_of(plant, Filter(bank.start, bank.predict, bank.update, bank.read, expect=bank.expect), rule)
+    events = events_of_process(plant, process, courses, sizes)
+    bank = Bank(plant, belief, events, onsets, max(1, len(events.onset) // GRID) if every is None else every)
+    filter = Filter(bank.start, bank.predict, bank.update, bank.read, expect=bank.expect)
+    return diagnoser_of(plant, filter, most_telling(events))

@@ -18,7 +18,7 @@ from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.estimation.decision import Reading
 from fdi_gym.estimation.interval import Interval
 from fdi_gym.faults import FaultScenario
-from fdi_gym.plant import Array, Plant
+from fdi_gym.plant import Array, NotApplicableError, Plant
 
 
 class Windowed(NamedTuple):
@@ -56,10 +56,12 @@ def known_onset_oracle(
         b_max: Largest random stuck position of aileron and rudder [deg].
 
     Raises:
-        NotApplicableError: Another plant.
+        NotApplicableError: Another plant, or gusts, which its model does not have.
         ValueError (from init): The number of episodes is not that of the scenarios.
     """
     check(plant)
+    if any(scenario.disturbance for scenario in scenarios):
+        raise NotApplicableError("its model has no gusts; told_events_oracle has")
     f, sizes = kalman_filter.nominal_filter(plant), Sizes((gamma[0], gamma[1]), (b_max[0], b_max[1]))
     steps = max((s.steps for s in scenarios), default=1)
     active, begins = (np.zeros((len(scenarios), steps + 1), bool) for _ in range(2))
