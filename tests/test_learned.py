@@ -37,6 +37,7 @@ from fdi_gym.diagnosis import (
 )
 from fdi_gym.discovery import load_plant
 from fdi_gym.listing import details
+from fdi_gym.plant import Plant
 from fdi_gym.suite import load_suite, suite_names
 from fdi_gym.testing import check_diagnoser
 
@@ -45,7 +46,7 @@ TINY = SequenceRecipe(
     flights=16, identify=8, chunk=8, passes=2, validation=4, validate=1, batch=8, hidden=16,
 )  # fmt: skip
 COMMITTED = sorted(weights.WEIGHTS.glob("*.safetensors"))
-LEARNED = ("sequence_net", "residual_net", "randomised_net", "ppo", "ppo_identification")  # networks
+LEARNED = ("sequence_net", "residual_net", "randomised_net", "attention_net", "ppo", "ppo_identification")  # networks
 CLOSED_FORM = ("pca", "dynamic_pca", "cva", "boosted_trees", "random_forest", "minirocket")  # what learns without torch
 NETWORKS = [path for path in COMMITTED if "_net-" in path.stem]
 
@@ -359,8 +360,8 @@ def test_splits_are_disjoint_from_the_suites_and_from_each_other():
 def test_every_recipe_trains_on_training_seeds(tiny, monkeypatch):
     """The seeds that a run draws are those that its card names."""
     drawn = []
-    draw = flights.draw
-    monkeypatch.setattr(flights, "draw", lambda process, seed: drawn.append(seed) or draw(process, seed))
+    draw = Plant.draw
+    monkeypatch.setattr(Plant, "draw", lambda plant, process, seed, *a: drawn.append(seed) or draw(plant, process, seed, *a))
     training = SupervisedTraining("sequence_net", build("B747Lateral"), TINY, seed=1, work=tiny.parent)
     training.chunk(0), training.chunk(1)
     first, last = weights.read_card(tiny).seeds["training"]
