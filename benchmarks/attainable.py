@@ -23,7 +23,7 @@ from fdi_gym.leaderboard import boards
 from fdi_gym.metrics import outcome
 from fdi_gym.scores import summarise
 from fdi_gym.suite import ActingSuite, load_suite
-from fdi_gym.tables import ceiling, markdown
+from fdi_gym.tables import markdown
 
 FIRST = 5_000_000  # fresh seeds: neither test nor validation nor training flights
 BANK = "onset_bank"
@@ -42,14 +42,13 @@ converged, or cannot run: faults that overlap, and sensors that fail in ways tha
 """
 
 
-def score(suite, scenarios, record, **settings):
+def score(plant, process, record, **settings):
     """Balanced accuracy per sample and per decision, log score, and the time [us] per sample."""
-    plant = suite.build()
-    method, begun = make_diagnoser(BANK, plant, process=suite.process, **settings), time.process_time()
+    method, begun = make_diagnoser(BANK, plant, process=process, **settings), time.process_time()
     said = run(method, record.obs)
     spent = time.process_time() - begun
-    scoring = plant.process(suite.process).scoring
-    outcomes = [outcome(plant, scoring, record, said, i) for i in range(len(scenarios))]
+    scoring = plant.process(process).scoring
+    outcomes = [outcome(plant, scoring, record, said, i) for i in range(len(record.length))]
     found = summarise(outcomes, len(plant.labels), [s.name for s in plant.estimated], plant.dt)
     return found, 1e6 * spent / record.length.sum()
 
@@ -59,11 +58,9 @@ def refined(name, count):
     suite = load_suite(name)
     fresh = msgspec.structs.replace(suite, seeds=[FIRST + i for i in range(count * suite.windows)], healthy=[])
     plant = suite.build()
-    episodes = range(fresh.episodes)
-    record = fresh.record(plant, episodes)
-    scenarios = fresh.scenarios(plant, episodes)
+    record = fresh.record(plant, range(fresh.episodes))
     for settings in SETTINGS:
-        found, spent = score(suite, scenarios, record, **settings)
+        found, spent = score(plant, suite.process, record, **settings)
         told = ", ".join(f"{key} {value}" for key, value in settings.items()) or "as it is"
         yield [told, *(f"{100 * found[kind]['balanced_accuracy']:.1f}" for kind in ("per_sample", "per_decision")),
                f"{found['log_score']:.3f}", f"{spent:.0f}"]  # fmt: skip
@@ -72,8 +69,8 @@ def refined(name, count):
 def brackets(results):
     """A row for each suite that has a ceiling: the best without the bank, the bank, the ceiling."""
     for board in boards(results):
-        above = [row for row in board.rows if ceiling(row)]
-        if isinstance(board.suite, ActingSuite) or not above:
+        top = board.top()
+        if isinstance(board.suite, ActingSuite) or top is None:
             continue
 
         def of(row):
@@ -83,7 +80,7 @@ def brackets(results):
         bank = next((row for row in board.rows if row.diagnoser == BANK), None)
         if not others:
             continue
-        top, best = max(above, key=of), others[-1]
+        best = others[-1]
         low = max(of(best), of(bank) if bank else 0.0)
         yield [f"[{board.suite.name}]({board.suite.name}.md)", f"{best.diagnoser} {100 * of(best):.1f}",
                f"{100 * of(bank):.1f}" if bank else "-", f"{top.diagnoser} {100 * of(top):.1f}",

@@ -96,11 +96,16 @@ class Board(NamedTuple):
 
         Empty where the board has no ceiling, or nothing that it could hold for.
         """
-        best, above = self.best(), [row for row in self.rows if ceiling(row)]
-        if best is None or not above:
+        best, top = self.best(), self.top()
+        if best is None or top is None:
             return []
-        scores = [row.metrics["per_sample"]["balanced_accuracy"] for row in (best, *above)]
-        return [scores[0], max(scores)]
+        low, high = (row.metrics["per_sample"]["balanced_accuracy"] for row in (best, top))
+        return [low, max(low, high)]
+
+    def top(self) -> Row | None:
+        """The highest ceiling."""
+        above = (row for row in self.rows if ceiling(row))
+        return max(above, key=lambda row: row.metrics["per_sample"]["balanced_accuracy"], default=None)
 
     def best(self) -> Row | None:
         """The best row of a method that is told nothing."""
@@ -229,10 +234,8 @@ def front(found: list[Board]) -> str:
         if isinstance(board.suite, ActingSuite):
             acting.append([link, size, str(len(board.rows)), acting_board.in_a_line(board.acted(board.suite))])
             continue
-        best, above = board.best(), max(
-            (row.metrics["per_sample"]["balanced_accuracy"] for row in board.rows if ceiling(row)), default=None
-        )  # fmt: skip
-        score = best.metrics["per_sample"]["balanced_accuracy"] if best else None
+        best, top = board.best(), board.top()
+        score, above = (row.metrics["per_sample"]["balanced_accuracy"] if row else None for row in (best, top))
         tied = len(tied_with_best(board.drawn(board.honest()))) if best else 0
         lines.append([
             link, size, str(len(board.rows)),
