@@ -12,7 +12,7 @@ the shape of the prior.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -136,7 +136,7 @@ def told_bank(
         r: Its hypotheses.
         scenarios: n of them.
         course: (n, K + 1) by which the hypotheses' lines are scaled at each sample; None: they keep their lengths.
-        allowed: (n, K + 1, labels) which labels can be at each sample; None: all.
+        allowed: (n, K + 1, labels) which labels can be from one change of the label to the next; None: all.
     """
     bank = _Told(plant, r, scenarios, course, allowed)
     rule = by_candidate(lambda reading, label: np.argmax(np.asarray(reading.probs), axis=1), 1)
@@ -152,6 +152,7 @@ class _Told:
         self.plant, self.r, self.scenarios, self.course, self.allowed = plant, r, scenarios, course, allowed
         assert r.model.lines is not None
         self.offset, self.direction = r.model.lines
+        self.healthy = r.model.replace(Q=r.model.Q[:1], lines=(self.offset[:1], self.direction[:1]))
         self.own = self.offset.shape[1] if plant.bare is None else len(plant.estimated)
         self.rise = r.rise * np.array([scenario.steps for scenario in scenarios])[:, None]
         self.checks = None if plant.bare is None else SensorChecks(plant)
@@ -176,6 +177,17 @@ class _Told:
         wide, n = length.reshape(-1, 1), len(length)
         return self.r.model.on(wide * np.tile(self.offset, (n, 1)), wide[..., None] * np.tile(self.direction, (n, 1, 1)))
 
+    def parts(self, s: Bank) -> Iterator[tuple[Array, AugmentedModel, int]]:
+        """The episodes in which something can be that has hypotheses, and the others, which need the healthy one alone.
+
+        Of each: which they are, the model and how many rows it has.
+        """
+        open_ = s.now & s.among[:, 1:].any(axis=1)
+        if open_.any():
+            yield np.flatnonzero(open_), self.sized(s.length[open_]), len(self.r.label)
+        if not open_.all():
+            yield np.flatnonzero(~open_), self.healthy, 1
+
     def predict(self, s: Bank, at: Interval) -> Bank:
         """Over the interval; at a change of the label all start from what the healthy one knows."""
         r, z, n = self.r, self.r.model.z, len(at.k)
@@ -190,38 +202,42 @@ class _Told:
         P[changed, :, z, :] = 0.0
         P[changed, :, :, z] = 0.0
         P[..., z, z] = np.where(changed[:, None, None, None], r.M0, P[..., z, z])
-        N = X.shape[-1]
-        X1, P1 = self.sized(length).predict("extended", X.reshape(-1, N), P.reshape(-1, N, N), at)
         among = s.allowed[each, np.minimum(k, s.allowed.shape[1] - 1)]
-        X1, P1 = X1.reshape(X.shape), P1.reshape(P.shape)
-        return s._replace(X=X1, P=P1, log=log, now=now, since=since, length=length, among=among)
+        moved, N = s._replace(X=X, P=P, log=log, now=now, since=since, length=length, among=among), X.shape[-1]
+        for of, model, count in self.parts(moved):
+            rows = of[:, None], np.arange(count)
+            X1, P1 = model.predict("extended", X[rows].reshape(-1, N), P[rows].reshape(-1, N, N), at.of(of))
+            X[rows], P[rows] = X1.reshape(-1, count, N), P1.reshape(-1, count, N, N)
+        return moved
 
     def update(self, s: Bank, at: Interval, y: Array, seen: Array) -> Bank:
-        """Weigh and correct all."""
-        n, count, N = s.X.shape
-        done = self.sized(s.length).update("extended", s.X.reshape(-1, N), s.P.reshape(-1, N, N), at, y, seen, self.r.R)
-        m = done.nu.shape[-1]
-        found = s._replace(
-            X=done.X.reshape(s.X.shape), P=done.P.reshape(s.P.shape), nu=done.nu.reshape(n, count, m)[:, 0],
-            S=done.S.reshape(n, count, m, m)[:, 0], log=s.log + done.log_likelihood.reshape(n, count),
-        )  # fmt: skip
+        """Weigh and correct all that predicted."""
+        N, m = s.X.shape[-1], s.nu.shape[-1]
+        X, P, log, nu, S = s.X.copy(), s.P.copy(), s.log.copy(), s.nu.copy(), s.S.copy()
+        for of, model, count in self.parts(s):
+            rows = of[:, None], np.arange(count)
+            wide = X[rows].reshape(-1, N), P[rows].reshape(-1, N, N)
+            done = model.update("extended", *wide, at.of(of), y[of], seen[of], self.r.R[:count])
+            X[rows], P[rows] = done.X.reshape(-1, count, N), done.P.reshape(-1, count, N, N)
+            log[rows] += done.log_likelihood.reshape(-1, count)
+            nu[of], S[of] = done.nu.reshape(-1, count, m)[:, 0], done.S.reshape(-1, count, m, m)[:, 0]
+        found = s._replace(X=X, P=P, nu=nu, S=S, log=log)
         if self.checks is None or s.checks is None:
             return found
-        return found._replace(checks=self.checks.update(s.checks, y, seen, Reading(nu=found.nu, S=found.S)))
+        return found._replace(checks=self.checks.update(s.checks, y, seen, Reading(nu=nu, S=S)))
 
     def by_label(self, s: Bank, log: Array) -> Array:
         """Log likelihood (n, labels) of each label that can be, on average over its hypotheses."""
-        n, labels = len(s.now), len(self.plant.labels)
-        found = np.full((n, labels), -np.inf)
-        for label in range(1, labels):
-            found[:, label] = logsumexp(log[:, self.r.label == label], axis=1)
+        labels = len(self.plant.labels)
+        found = logsumexp(np.where(self.r.label == np.arange(labels)[:, None], log[:, None], -np.inf), axis=2)
+        found[:, 0] = -np.inf
         if self.checks is not None and s.checks is not None:
             gain = self.checks.repeated(s.checks)
             least = s.log[:, :1] if self.allowed is None else s.log.max(axis=1, keepdims=True)  # the reading was certain
             found = np.where(gain > 0, np.maximum(found, least + 0.5 * gain), found)
         found[~s.among] = -np.inf
         found[~s.now] = -np.inf
-        found[~s.now, 0] = 0.0
+        found[~np.isfinite(found[:, 1:]).any(axis=1), 0] = 0.0
         return found
 
     def read(self, s: Bank) -> Reading:

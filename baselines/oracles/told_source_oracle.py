@@ -86,9 +86,10 @@ def told_source_oracle(plant: Plant, belief: Belief, *, scenarios: Sequence[Faul
         raise NotApplicableError(f"no label of {plant.id} is a sensor's fault; with the option sensor_faults there are")
     labels, of_plant = len(plant.labels), len(plant.bare.labels)
     label = true_labels(plant, scenarios)
-    allowed = (label >= of_plant)[..., None] == (np.arange(labels) >= of_plant)
-    hypotheses = told_bank(plant, rows(plant, even(plant, belief)), scenarios, allowed=allowed)
+    told, of_sensor = (label >= of_plant)[..., None], np.arange(labels) >= of_plant
     ceiling = own_ceiling(plant.bare, scenarios)
+    allowed = told == of_sensor if ceiling is None else told & of_sensor
+    hypotheses = told_bank(plant, rows(plant, even(plant, belief)), scenarios, allowed=allowed)
     if ceiling is None:
         return hypotheses
     own = widened(ceiling, plant.bare, plant)
