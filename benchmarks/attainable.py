@@ -16,7 +16,7 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[name] = "1"
 
 import msgspec
-from sensors import sections_of, write_sections
+from sections import sections_of, write_sections
 
 from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.leaderboard import boards

@@ -1,118 +1,162 @@
 """What is found of failing sensors, plant by plant and kind by kind, and whether they are told from the plant's own faults.
 
-    python benchmarks/sensors.py [PLANT ...] [--methods augmented_ekf told_source_oracle] [--flights 40]
-                                 [--page leaderboards/sensors.md]
+    python benchmarks/sensors.py [--page leaderboards/sensors.md]
 
-Flights whose sensors fail in one way each, flights with the plant's own standard faults, and healthy ones; the methods know
-the process "mixed". What counts is what is declared at the flight's last sample. Sections of other plants that the page has
-stay there.
+Made of the rows of the suites whose process is "mixed".
 """
 
 import argparse
-import os
+from collections import defaultdict
 from pathlib import Path
-
-for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    os.environ[name] = "1"
+from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import binomtest
+from sections import share, write_sections
 
-from fdi_gym.diagnosis import NotApplicableError, make_diagnoser, run
-from fdi_gym.discovery import load_plant, plant_sources
-from fdi_gym.engine import simulate
-from fdi_gym.faults import draw
-from fdi_gym.sensors import KINDS, of_kind
-from fdi_gym.tables import markdown
+from fdi_gym.diagnosis import diagnosers
+from fdi_gym.leaderboard import read_board
+from fdi_gym.sensors import KINDS
+from fdi_gym.suite import load_suite
+from fdi_gym.tables import ceiling, clairvoyant, markdown
 
-FIRST = 4_600_000  # seed; neither test nor validation nor training flights
-METHODS = ("augmented_ekf", "multiple_model_ekf", "sequence_net", "told_source_oracle")
+ALL, OWN, HEALTHY = "All plants", "the plant's own", "healthy"
+LEARNED = "baselines.learned."
 INTRODUCTION = """# Sensors that fail
 
-Written by `python benchmarks/sensors.py --page leaderboards/sensors.md`. In each row flights in which a sensor fails in one
-way (`fdi_gym.sensors` says how much), in which the plant's own standard faults act, or healthy ones; a method knows the
-process "mixed", not which of these it meets, and what counts is what it declares at the flight's last sample.
-`sequence_net` was trained on that process, where it is there; `told_source_oracle` is a ceiling: it is told when the label
-changes and whether a sensor fails. Percent, with 95 % intervals (Clopper and Pearson); the delay is the median time from the
-onset to the alarm of those that are found. "as the plant's" are flights whose sensor failed and that are called one of the
-plant's own faults; for the plant's own faults it is the reverse.
+Written by `python benchmarks/sensors.py` from the rows of the suites `*-mixed`: half of the faulty flights have a sensor's
+fault in place of the plant's own. `fdi_gym.sensors` says what each kind is and how large; where a suite has another severity
+its page says so. The first table of each plant gives the share of right decisions, one for each window of a fault and each
+healthy flight, in percent; methods marked "*" know a part of the truth. The second gives more of the best filter, the best
+learned method and the highest ceiling, with 95 % intervals (Clopper and Pearson): how many of the faults that begin from
+healthy are detected, the median time until then, and the confusion that matters, a sensor's fault taken for one of the
+plant's own or the reverse. "False alarms" are healthy flights that are declared faulty.
+
+The general filters know biases as lines of the fault vector, and check each channel for readings that repeat, have grown
+noisier or jump; a gain is neither.
 """
 
 
-def flights_of(plant, what, count):
-    """So many flights of a kind of sensor fault, of the plant's own faults, or healthy."""
-    processes = {"plant": plant.bare.process("standard"), "healthy": plant.process("fault-free")}
-    process, found, seed = processes[what] if what in processes else of_kind(plant, what), [], FIRST
-    while len(found) < count:
-        scenario = draw(process, seed)
-        found += [scenario] if scenario.faults or what == "healthy" else []
-        seed += 1
+class Found(NamedTuple):
+    """What was said of the faults of one kind."""
+
+    right: list[bool]
+    crossed: list[bool]  # of the decisions: a sensor's fault taken for the plant's own, or the reverse
+    declared: list[bool]  # a fault, whichever
+    detected: list[bool]
+    delays: list[int]  # samples, of those detected
+
+
+def by_kind(plant, scenarios, outcomes):
+    """What a row says of each kind of fault.
+
+    Args:
+        plant: The plant whose sensors may fail.
+        scenarios: Of the flights.
+        outcomes: Of the flights, of one method.
+    """
+    own, found = len(plant.bare.labels), defaultdict(lambda: Found([], [], [], [], []))
+    for scenario, outcome in zip(scenarios, outcomes, strict=True):
+        kinds = defaultdict(list)
+        for fault in scenario.faults:
+            kinds[fault.mode].append(fault.kind)
+        for what in (outcome.decisions, outcome.onsets):
+            met = defaultdict(int)
+            for entry in what:
+                of_sensor = entry.label >= own
+                name = OWN if entry.label else HEALTHY
+                if of_sensor:
+                    mode = plant.labels[entry.label].name
+                    name = kinds[mode][met[mode]]
+                    met[mode] += 1
+                to = found[name]
+                if what is outcome.decisions:
+                    to.right.append(entry.declared == entry.label)
+                    to.declared.append(entry.declared > 0)
+                    to.crossed.append(0 < entry.declared < own if of_sensor else entry.declared >= own)
+                elif entry.fresh and not entry.alarmed:
+                    to.detected.append(entry.detection is not None)
+                    to.delays.extend([] if entry.detection is None else [entry.detection])
     return found
 
 
-def share(hits):
-    """A share in percent with its interval."""
-    low, high = binomtest(int(hits.sum()), hits.size).proportion_ci(0.95)
-    return f"{100 * hits.mean():.0f} ({100 * low:.0f}-{100 * high:.0f})"
+def best_of(rows):
+    """The row with the highest balanced accuracy; None of none."""
+    return max(rows, key=lambda row: row.metrics["per_sample"]["balanced_accuracy"], default=None)
 
 
-def study(plant, methods, count):
-    """A row for each method and kind."""
-    own = len(plant.bare.labels)
-    for what in (*KINDS, "plant", "healthy"):
-        scenarios = flights_of(plant, what, count)
-        record = simulate(plant, scenarios)
-        rows, last = np.arange(count), record.length
-        truth = record.label[rows, last]
-        for name in methods:
-            try:
-                diagnoser = make_diagnoser(name, plant, process="mixed", scenarios=scenarios)
-            except NotApplicableError:
+def shown(board):
+    """The best filter, the best learned method and the highest ceiling of a board, where it has them."""
+    learned = [r for r in board.honest() if diagnosers()[r.diagnoser].build.__module__.startswith(LEARNED)]
+    filters = [r for r in board.honest() if r not in learned]
+    return [row for row in (best_of(filters), best_of(learned), board.top()) if row]
+
+
+def summary(board, found):
+    """A line for each of a board's chosen methods: scores, and sensors against the plant's own."""
+    for row in shown(board):
+        f = found[row.diagnoser]
+        right, crossed = (
+            np.concatenate([np.array(part, bool) for part in parts])
+            for parts in ([f[kind].right for kind in KINDS], [f[kind].crossed for kind in KINDS])
+        )
+        scores = (f"{100 * row.metrics[kind]['balanced_accuracy']:.1f}" for kind in ("per_sample", "per_decision"))
+        own = f[OWN]
+        yield [board.suite.plant, row.diagnoser + " *" * ceiling(row), *scores, share(right), share(np.array(own.right)),
+               share(crossed), share(np.array(own.crossed))]  # fmt: skip
+
+
+def section(board, found):
+    """What is said of a plant."""
+    plant, kinds = board.plant, [*KINDS, OWN, HEALTHY]
+    ranked = sorted(board.rows, key=lambda row: -row.metrics["per_decision"]["balanced_accuracy"])
+
+    def percent(row, kind):
+        right = found[row.diagnoser][kind].right
+        return f"{100 * np.mean(right):.0f}" if right else "-"
+
+    count = {kind: len(found[ranked[0].diagnoser][kind].right) for kind in kinds}
+    every = markdown(
+        ["method", *(f"{kind} ({count[kind]})" for kind in kinds)],
+        [[row.diagnoser + " *" * clairvoyant(row), *(percent(row, kind) for kind in kinds)] for row in ranked],
+    )
+    lines = []
+    for row in shown(board):
+        for kind in kinds:
+            f = found[row.diagnoser][kind]
+            if not f.right:
                 continue
-            said = run(diagnoser, record.obs)
-            label = said.label[rows, last]
-            if what == "healthy":
-                yield [name, what, share(said.alarm.any(axis=1)), "", "", ""]
-                continue
-            acts = record.label > 0
-            onset = acts.argmax(axis=1)
-            alarmed = said.alarm & acts
-            found = alarmed.any(axis=1)
-            delay = np.median((alarmed.argmax(axis=1) - onset)[found]) * plant.dt if found.any() else np.nan
-            other = (label >= own) if what == "plant" else (label > 0) & (label < own)
-            yield [name, what, share(label > 0), share(label == truth), f"{delay:.2f} s", share(other)]
+            right, declared, crossed, detected = (np.array(a, bool) for a in (f.right, f.declared, f.crossed, f.detected))
+            delay = f"{np.median(f.delays) * plant.dt:.2f} s" if f.delays else "-"
+            if kind == HEALTHY:
+                lines.append([row.diagnoser, "false alarms", share(declared), "", "", share(crossed)])
+            else:
+                seen = share(detected) if detected.size else "-"
+                lines.append([row.diagnoser, kind, seen, delay, share(right), share(crossed)])
+    head = ["method", "what fails", "detected %", "median delay", "right label %", "sensor for plant, or reverse %"]
+    told = f"[{board.suite.name}]({board.suite.name}.md): {board.suite.description}."
+    return f"{told}\n\nRight decisions in percent (how many there are):\n\n{every}\n\nIn detail:\n\n{markdown(head, lines)}"
 
 
-def sections_of(page):
-    """What a page says of each plant."""
-    parts = page.read_text().split("\n## ")[1:] if page is not None and page.is_file() else []
-    return {name: text.strip() for name, text in (part.split("\n", 1) for part in parts)}
-
-
-def write_sections(page, introduction, sections):
-    """The page: what it is about, and a section for each plant."""
-    parts = [introduction, *(f"\n## {name}\n\n{text}" for name, text in sorted(sections.items()))]
-    page.write_text("\n".join(parts).rstrip() + "\n")
+def page(results):
+    """The page's sections by name."""
+    folders = [folder for folder in sorted(results.iterdir()) if load_suite(folder.name).process == "mixed"]
+    sections, lines = {}, []
+    for board in map(read_board, folders):
+        scenarios = board.suite.scenarios(board.plant, range(board.suite.episodes))
+        found = {name: by_kind(board.plant, scenarios, outcomes) for name, outcomes in board.outcomes.items()}
+        sections[board.suite.plant] = section(board, found)
+        lines += summary(board, found)
+    head = ["plant", "method", "per sample %", "per decision %", "right: sensors %", "the plant's own %",
+            "a sensor's taken for the plant's %", "the plant's for a sensor's %"]  # fmt: skip
+    return {ALL: "Best filter, best learned method, highest ceiling.\n\n" + markdown(head, lines), **sections}
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("plants", nargs="*", default=list(plant_sources()))
-    parser.add_argument("--methods", nargs="+", default=METHODS)
-    parser.add_argument("--flights", type=int, default=40)
-    parser.add_argument("--page", type=Path)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--results", type=Path, default=Path("leaderboards/results"))
+    parser.add_argument("--page", type=Path, default=Path("leaderboards/sensors.md"))
     arguments = parser.parse_args()
-    head = ["method", "what fails", "alarm %", "right label %", "delay", "as the plant's %"]
-    sections = sections_of(arguments.page)
-    for plant_id in arguments.plants:
-        rows = []
-        for row in study(load_plant(plant_id, sensor_faults=True), arguments.methods, arguments.flights):
-            rows.append(row)
-            print(plant_id, *row, flush=True)
-        table = markdown(head, sorted(rows, key=lambda row: arguments.methods.index(row[0])))
-        sections[plant_id] = f"{arguments.flights} flights a row.\n\n{table}"
-        if arguments.page:
-            write_sections(arguments.page, INTRODUCTION, sections)
+    write_sections(arguments.page, INTRODUCTION, page(arguments.results))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import numpy as np
 from scipy.stats import mannwhitneyu
-from sensors import sections_of, share, write_sections
+from sections import sections_of, share, write_sections
 
 from fdi_gym.diagnosis import NotApplicableError, diagnosers, make_diagnoser
 from fdi_gym.diagnosis.conforming import decided, of_each_label

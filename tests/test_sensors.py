@@ -4,6 +4,9 @@ import copy
 import dataclasses
 import functools
 import pickle
+import subprocess
+import sys
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -400,3 +403,9 @@ def test_a_lag_beyond_the_flight_is_refused(open_loop):
         simulate(open_loop, [flight(open_loop, sampling=Sampling(delays={"p": 61}))])
     with pytest.raises(ValueError, match="may fail already"):
         with_sensor_faults(open_loop)
+
+
+def test_the_page_of_sensors_is_that_of_the_rows(tmp_path):
+    page = tmp_path / "sensors.md"
+    subprocess.run([sys.executable, "benchmarks/sensors.py", "--page", page], check=True)
+    assert page.read_text() == Path("leaderboards/sensors.md").read_text()

@@ -5,8 +5,8 @@ large, how long it lasts, and which physical parameters differ from flight to fl
 Kalman filter flies healthy. At every few samples each kind of event may have begun: a filter starts from what the healthy
 one knows, with the magnitudes' prior, and goes on by itself; its weight is the probability of that beginning, times the
 likelihood of what was measured since. A kind keeps so many onsets: of neighbours those two become one, mean and covariance
-matched, that are least likely for how close they are. Where events end, the filters' weight goes back to the healthy one,
-which becomes the mixture.
+matched, that are least likely for how close they are; one whose weight has become negligible is given up. Where events end,
+the filters' weight goes back to the healthy one, which becomes the mixture.
 
 With a linear model, Gaussian sizes and as many onsets as samples this is the Bayes diagnoser of the process, what any method
 could attain that is told no more: the line by which others are measured, as far as its score stands still when onsets, cells
@@ -27,7 +27,7 @@ from scipy.special import logsumexp
 
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.diagnosis.fitting import FLOOR, VALIDATION_SEED
-from fdi_gym.estimation.augmented import AugmentedModel, augmented, on_lines
+from fdi_gym.estimation.augmented import augmented, on_lines
 from fdi_gym.estimation.belief import Belief, fault_inputs
 from fdi_gym.estimation.decision import Reading, Rule, by_candidate
 from fdi_gym.estimation.events import Events, events_of
@@ -38,6 +38,7 @@ from fdi_gym.plant import Array, NotApplicableError, Plant
 FIRST, DRAWN = 700_000, 2000  # scenarios from VALIDATION_SEED + FIRST on
 GRID = 200  # onsets in a flight, where it is not said how far they are apart
 NEVER = -1e300  # log weight of a place where nothing is
+NEGLIGIBLE = -30.0  # log weight, as a share of all, below which a filter is given up
 
 
 class Onsets(NamedTuple):
@@ -103,19 +104,23 @@ class Bank:
             np.tile(self.plant.trim_command, (n, 1)), np.zeros((n, m)), np.tile(model.R, (n, 1, 1)),
         )  # fmt: skip
 
-    def lines(self, s: Onsets) -> tuple[Array, Array]:
-        """Offsets and directions of all filters: (n (1 + r s), p), (n (1 + r s), p, f)."""
-        n, (_, p, f), (e, c) = len(s.X), self.events.direction.shape, self.events.spread.shape
-        offset, direction = np.zeros((n, self.count, p + e)), np.zeros((n, self.count, p + e, f + c))
-        wide = s.length[..., None] * self.events.offset[:, None] + s.held
-        offset[:, 1:, :p] = wide.reshape(n, -1, p)
-        direction[:, 1:, :p, :f] = (s.length[..., None, None] * self.events.direction[:, None]).reshape(n, -1, p, f)
-        direction[:, :, p:, f:] = self.events.spread
-        return offset.reshape(-1, p + e), direction.reshape(-1, p + e, f + c)
+    def live(self, s: Onsets) -> tuple[Array, Array]:
+        """Which filters run: episodes and places (rows,) of the healthy ones and of all that have a weight."""
+        runs = s.log > NEVER
+        runs[:, 0] = True
+        return np.nonzero(runs)  # type: ignore[return-value]
 
-    def sized(self, s: Onsets) -> AugmentedModel:
-        """The model with these lines."""
-        return self.model.on(*self.lines(s))
+    def lines(self, s: Onsets, of: Array, place: Array) -> tuple[Array, Array]:
+        """Offsets (rows, p) and directions (rows, p, f) of these filters."""
+        (_, p, f), (e, c) = self.events.direction.shape, self.events.spread.shape
+        offset, direction = np.zeros((len(of), p + e)), np.zeros((len(of), p + e, f + c))
+        acts = place > 0
+        kind, slot = np.divmod(place[acts] - 1, self.s)
+        length = s.length[of[acts], kind, slot]
+        offset[acts, :p] = length[:, None] * self.events.offset[kind] + s.held[of[acts], kind, slot]
+        direction[acts, :p, :f] = length[:, None, None] * self.events.direction[kind]
+        direction[:, p:, f:] = self.events.spread
+        return offset, direction
 
     def ended(self, s: Onsets, step: Array) -> Onsets:
         """The weight of events that end within the period before a step goes back to the healthy filter."""
@@ -154,7 +159,7 @@ class Bank:
         age = step[:, None, None] - s.onset
         gap = np.diff(s.onset, axis=2) / (age[..., 1:] + self.every)
         pair = np.logaddexp(log[..., :-1], log[..., 1:]) + 2.0 * np.log(np.maximum(gap, 1e-9))
-        pair = np.where(log[..., :-1] <= NEVER, -np.inf, pair)  # empty places first
+        pair = np.where(np.minimum(log[..., :-1], log[..., 1:]) <= NEVER, -np.inf, pair)  # empty places first
         j = np.argmin(pair, axis=2)
         two = np.stack([j, j + 1], axis=2)
         at = (each[0][..., None], each[1][:, None], two)
@@ -212,20 +217,22 @@ class Bank:
         """All filters, over the interval."""
         age = (at.k[:, None, None] - s.onset) * self.plant.dt
         s = s._replace(length=self.events.at(np.maximum(age, 0.0)), u=at.u)
-        N = len(self.model.scale)
-        X, P = self.sized(s).predict("extended", s.X.reshape(-1, N), s.P.reshape(-1, N, N), at)
-        return s._replace(X=X.reshape(s.X.shape), P=P.reshape(s.P.shape))
+        rows = self.live(s)
+        X, P = s.X.copy(), s.P.copy()
+        X[rows], P[rows] = self.model.on(*self.lines(s, *rows)).predict("extended", X[rows], P[rows], at.of(rows[0]))
+        return s._replace(X=X, P=P)
 
     def update(self, s: Onsets, at: Interval, y: Array, seen: Array) -> Onsets:
-        """Weigh and correct all."""
-        N, m, n = len(self.model.scale), len(self.model.R), len(s.X)
-        done = self.sized(s).update("extended", s.X.reshape(-1, N), s.P.reshape(-1, N, N), at, y, seen)
-        log = np.maximum(s.log + done.log_likelihood.reshape(n, -1), NEVER)
+        """Weigh and correct those that run; of those that have become negligible the place is free."""
+        of, place = rows = self.live(s)
+        X, P, log = s.X.copy(), s.P.copy(), s.log.copy()
+        model, healthy = self.model.on(*self.lines(s, *rows)), place == 0
+        done = model.update("extended", X[rows], P[rows], at.of(of), y[of], seen[of])
+        X[rows], P[rows] = done.X, done.P
+        log[rows] = np.maximum(log[rows] + done.log_likelihood, NEVER)
         log = np.where(s.log <= NEVER, NEVER, log - logsumexp(log, axis=1, keepdims=True))
-        return s._replace(
-            X=done.X.reshape(s.X.shape), P=done.P.reshape(s.P.shape), log=log, nu=done.nu.reshape(n, -1, m)[:, 0],
-            S=done.S.reshape(n, -1, m, m)[:, 0],
-        )  # fmt: skip
+        log[:, 1:] = np.where(log[:, 1:] < NEGLIGIBLE, NEVER, log[:, 1:])
+        return s._replace(X=X, P=P, log=log, nu=done.nu[healthy], S=done.S[healthy])
 
     def read(self, s: Onsets) -> Reading:
         """Probabilities of the labels, and the mean of the fault vector."""
@@ -236,9 +243,11 @@ class Bank:
         for kind, label in enumerate(self.events.label.tolist()):
             probs[:, label] += by_kind[:, kind]
         probs /= probs.sum(axis=1, keepdims=True)
-        offset, direction = self.lines(s)
-        theta = offset + (direction @ s.X[..., self.model.z].reshape(len(offset), -1, 1))[..., 0]
-        mean = (w[..., None] * theta.reshape(n, self.count, -1)).sum(axis=1)
+        rows = self.live(s)
+        offset, direction = self.lines(s, *rows)
+        theta = np.zeros((n, self.count, offset.shape[1]))
+        theta[rows] = offset + (direction @ s.X[rows][:, self.model.z, None])[..., 0]
+        mean = (w[..., None] * theta).sum(axis=1)
         z = np.zeros((n, self.p))
         for j, place in self.known:
             z[:, j] = mean[:, place]
