@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import PLANTS, build
+from numpy.testing import assert_allclose
 from safetensors.numpy import load_file, save_file
 
 from baselines.learned import _attention, attention, features, flights, probabilities, recipes, sequence_net, weights
@@ -91,6 +92,39 @@ def test_identified_residuals_are_white_where_the_plant_is_linear_and_healthy():
     e, _, _ = features.information(model, phi, psi, z[:, 20:, 0, :4])
     assert np.allclose(np.cov(e.reshape(-1, 4).T), np.eye(4), atol=0.05)
     assert abs(np.mean(e[:, 1:] * e[:, :-1])) < 0.02
+
+
+@pytest.mark.parametrize("plant_id", PLANTS)
+def test_a_sensor_that_does_not_report_says_nothing(plant_id):
+    plant, shape = build(plant_id), FeatureShape(stride=4, lags=3, degree=1)
+    record = flights.fly(plant, Condition("standard", {}), range(TRAINING, TRAINING + 6))
+    obs, n_y = record.obs[:, :200].copy(), len(plant.outputs)
+    z = features.blocks(plant, obs, shape.stride)
+    delta = flights.at_steps(features.deviation(plant, record.target), shape.stride)[:, : z.shape[1]]
+    model = features.identify(plant, shape, [(z, delta)])
+
+    def after(obs, samples):
+        stream = features.begin(plant, shape, len(obs))
+        for k in range(samples):
+            stream, _ = features.add(plant, shape, model, stream, obs[:, k], k)
+        return stream
+
+    before = after(obs, 100)
+    obs[:, 100:104, :n_y] = np.nan  # a whole block
+    silent = after(obs, 104)
+    keep = (1 - 1 / features.MEMORIES)[:, None]
+    assert_allclose(silent.g, keep * before.g)  # forgotten, and nothing new
+    assert_allclose(silent.info, keep[..., None] * before.info)
+    phi, _ = features.regressors(plant, shape, before.past, silent.past[:, 0])
+    assert_allclose(silent.past[:, 0, 0, :n_y], features.expected(model, phi))
+    obs = record.obs[:, :104].copy()
+    obs[:, 103, 0] = np.nan  # the last of a block, of one sensor
+    part, whole = after(obs, 104), after(record.obs, 104)
+    slope = (features.expected(model, phi)[:, 0] - before.past[:, 0, 1, 0]) / 2.5
+    rest = plant.scale(obs)[:, 100:103, 0]
+    assert_allclose(part.past[:, 0, 0, 0], rest.mean(axis=1) + 0.5 * slope)
+    assert_allclose(part.past[:, 0, 1, 0], rest[:, -1] + slope)
+    assert_allclose(part.past[:, 0, :, 1:], whole.past[:, 0, :, 1:])
 
 
 @pytest.mark.parametrize("path", NETWORKS, ids=lambda p: p.stem)

@@ -12,6 +12,10 @@ then shown as its blocks, its whitened residuals e = R^(-1/2) (y - W phi), and t
 estimates of delta with several memories, from exponentially forgotten sums of S'e and S'S, S = R^(-1/2) [V_j psi]. All
 of it is causal, and nothing of it knows the plant's equations: it is learned from the observations and labels of
 training flights.
+
+An output that did not report in a part of a block has the mean and the newest of its reports, moved along the slope that the
+model expects to where they stand for; one that did not report at all has what the model expects, without effect on the
+estimates; a command is what it was.
 """
 
 from __future__ import annotations
@@ -47,6 +51,11 @@ class FeatureShape(NamedTuple):
     def period(self) -> int:
         """Samples per step of the network."""
         return self.stride * self.every
+
+    @property
+    def linear(self) -> bool:
+        """Whether the model is: such a one runs on through a gap, one with products runs away."""
+        return max(self.degree, self.effects) == 1
 
 
 class FeatureModel(NamedTuple):
@@ -138,11 +147,26 @@ def tensor_shapes(plant: Plant, shape: FeatureShape) -> dict[str, tuple[int, ...
     return {f"model.{name}": value for name, value in found.items()}
 
 
-def information(model: FeatureModel, phi: Array, psi: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Whitened residuals e (..., n_y), S'e (..., p) and S'S (..., p, p) of mean outputs y (..., n_y)."""
-    e = (y - phi @ model.W.T.astype(float)) @ model.whiten.T.astype(float)
-    S = psi @ np.einsum("ab,jbx->xaj", model.whiten, model.V).astype(float).reshape(psi.shape[-1], -1)
-    S = S.reshape(*psi.shape[:-1], len(model.whiten), len(model.V))
+def expected(model: FeatureModel, phi: Array) -> Array:
+    """The mean outputs (..., n_y) of healthy flight."""
+    return phi @ model.W.T.astype(float)
+
+
+def information(
+    model: FeatureModel, phi: Array, psi: Array, y: Array, heard: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """Whitened residuals e (..., n_y), S'e (..., p) and S'S (..., p, p) of mean outputs y (..., n_y).
+
+    Outputs that were not heard (..., n_y) have no residual, and no fault shows in them.
+    """
+    r = y - expected(model, phi)
+    if heard is None or heard.all():
+        e = r @ model.whiten.T.astype(float)
+        S = psi @ np.einsum("ab,jbx->xaj", model.whiten, model.V).astype(float).reshape(psi.shape[-1], -1)
+        S = S.reshape(*psi.shape[:-1], len(model.whiten), len(model.V))
+    else:
+        e = (r * heard) @ model.whiten.T.astype(float)
+        S = model.whiten @ (heard[..., None] * np.einsum("jbx,...x->...bj", model.V, psi))
     St = np.swapaxes(S, -1, -2)
     return e, (St @ e[..., None])[..., 0], St @ S
 
@@ -197,8 +221,11 @@ def standardised(plant: Plant, shape: FeatureShape, model: FeatureModel, z: Arra
 class Stream(NamedTuple):
     """The state of a stream of samples for n episodes; `add` takes one sample each."""
 
-    count: Array  # (n,) samples of the block that is being filled,
-    total: Array  # (n, n_obs) and their sum
+    count: Array  # (n, n_obs) reports in the block that is being filled,
+    total: Array  # (n, n_obs) their sum,
+    when: Array  # (n, n_obs) that of their places in the block, 1 to stride,
+    last: Array  # (n, n_obs) and the last of these places
+    newest: Array  # (n, n_obs) the last report of each channel
     past: Array  # (n, lags, 2, n_obs), newest first
     filled: Array  # (n,) blocks so far
     g: Array  # (n, M, p)
@@ -212,7 +239,7 @@ def begin(plant: Plant, shape: FeatureShape, n: int) -> Stream:
     """The state before the first sample."""
     p, M, width = len(plant.estimated), len(MEMORIES), len(plant.observed)
     return Stream(
-        np.zeros(n), np.zeros((n, width)), np.zeros((n, shape.lags, 2, width)), np.zeros(n, np.int64),
+        *np.zeros((5, n, width)), np.zeros((n, shape.lags, 2, width)), np.zeros(n, np.int64),
         np.zeros((n, M, p)), np.zeros((n, M, p, p)), np.zeros(n), np.zeros((n, width)), np.zeros((n, len(plant.outputs))),
     )  # fmt: skip
 
@@ -221,26 +248,46 @@ def add(
     plant: Plant, shape: FeatureShape, model: FeatureModel, stream: Stream, obs: Array, k: int
 ) -> tuple[Stream, Array | None]:  # fmt: skip
     """Sample k (n, n_obs): the state after it and, at the end of a step, what `features` has there (n, n_features)."""
-    newest = plant.scale(obs)
-    stream = stream._replace(count=stream.count + 1, total=stream.total + newest)
+    sample = plant.scale(obs)
+    there = ~np.isnan(sample)
+    place = k % shape.stride + 1.0
+    stream = stream._replace(
+        count=stream.count + there, total=stream.total + np.where(there, sample, 0.0), when=stream.when + place * there,
+        last=np.where(there, place, stream.last), newest=np.where(there, sample, stream.newest),
+    )  # fmt: skip
     if (k + 1) % shape.stride:
         return stream, None
-    stream = _close_block(plant, shape, model, stream, newest)
+    stream = _close_block(plant, shape, model, stream)
     if (k + 1) % shape.period:
         return stream, None
-    seen = _assembled(shape, model, stream.means / stream.blocks[:, None], newest, stream.residuals, stream.g, stream.info)
+    means = stream.means / stream.blocks[:, None]
+    seen = _assembled(shape, model, means, stream.newest, stream.residuals, stream.g, stream.info)
     zeros = (np.zeros_like(a) for a in (stream.blocks, stream.means, stream.residuals))
     return stream._replace(**dict(zip(("blocks", "means", "residuals"), zeros, strict=True))), seen
 
 
-def _close_block(plant: Plant, shape: FeatureShape, model: FeatureModel, stream: Stream, newest: Array) -> Stream:
-    now = np.stack([stream.total / stream.count[:, None], newest], axis=1)
+def _close_block(plant: Plant, shape: FeatureShape, model: FeatureModel, stream: Stream) -> Stream:
+    n_y, heard, middle = len(plant.outputs), stream.count > 0, (shape.stride + 1) / 2
+    mean = stream.total / np.maximum(stream.count, 1.0)
+    if not heard.all():
+        mean = np.where(heard, mean, stream.past[:, 0, 0])  # a command is what it was
+    now = np.stack([mean, stream.newest], axis=1)
     phi, psi = regressors(plant, shape, stream.past, now)
-    e, g, info = information(model, phi, psi, now[:, 0, : len(plant.outputs)])
+    part = stream.count[:, :n_y] < shape.stride
+    if part.any():
+        ahead = expected(model, phi)
+        slope = (ahead - stream.past[:, 0, 1, :n_y]) / middle  # per sample
+        early = middle - stream.when[:, :n_y] / np.maximum(stream.count[:, :n_y], 1.0)
+        for row, filled in (
+            (0, np.where(heard[:, :n_y], mean[:, :n_y] + slope * early, ahead)),
+            (1, np.where(heard[:, :n_y], stream.newest[:, :n_y] + slope * (shape.stride - stream.last[:, :n_y]), ahead)),
+        ):
+            now[:, row, :n_y] = np.where(part, filled, now[:, row, :n_y])
+    e, g, info = information(model, phi, psi, now[:, 0, :n_y], heard[:, :n_y])
     ready = (stream.filled >= shape.lags).astype(float)
     keep = (1 - 1 / MEMORIES)[:, None]
     return Stream(
-        np.zeros_like(stream.count), np.zeros_like(stream.total),
+        *np.zeros((4, *stream.total.shape)), now[:, 1],
         np.concatenate([now[:, None], stream.past[:, :-1]], axis=1), stream.filled + 1,
         keep * stream.g + (g * ready[:, None])[:, None],
         keep[..., None] * stream.info + (info * ready[:, None, None])[:, None],

@@ -95,7 +95,7 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
             h, diagnosis = answer(np.concatenate(parts, axis=1), h)
         return (k + 1, stream, h, [own for own, _ in further], diagnosis), diagnosis
 
-    return Diagnoser(init, update)
+    return Diagnoser(init, update, gaps=shape.linear and all(f.gaps for f in filters))
 
 
 @trainer("sequence_net", "Recurrent network on observations, supervised")
