@@ -2,11 +2,12 @@
 
 import json
 
+import msgspec
 import numpy as np
 import pytest
 from conftest import ROOT, build
 
-from fdi_gym.diagnosis import NotApplicableError, diagnosers, find_diagnoser, fitting, knowledge, make_diagnoser
+from fdi_gym.diagnosis import NotApplicableError, conforming, diagnosers, find_diagnoser, fitting, knowledge, make_diagnoser
 from fdi_gym.diagnosis.knowledge import Fits, fits_file, write_fits
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.data import digest
@@ -149,3 +150,26 @@ def test_a_belief_is_near_what_the_data_sheet_declares():
 def test_flights_of_a_fit_are_validation_flights():
     assert fitting.VALIDATION_SEED == 2_000_000
     assert fitting.VALIDATION_SEED + fitting.FIRST + 100 < 3_000_000
+
+
+@pytest.mark.parametrize("kind", ["belief", "calibration", "conformity"])
+def test_fits_are_renewed_where_the_code_gives_the_same(kind, tmp_path, monkeypatch):
+    monkeypatch.setattr(conforming, "EACH", 4)
+    suite = load_suite("b747-standard")
+    if kind == "conformity":
+        suite = msgspec.structs.replace(suite, options={**suite.options, "unseen": True}, process="unseen")
+    entry, path = find_diagnoser("conformal_bayes_bank" if kind == "conformity" else "augmented_ekf"), tmp_path / "fits.json"
+    [(_, fits)] = knowledge.fit_suites([entry], [suite], 1).items()
+    held = {"belief": fits.beliefs, "calibration": fits.calibrations, "conformity": fits.conformities}[kind]
+    [key] = held
+    write_fits(path, msgspec.structs.replace(fits, code="of another time"))
+    assert knowledge.renewed(path, [entry], [suite], 1, 0).code == fits.code
+    changed = {
+        "belief": lambda b: msgspec.structs.replace(b, m_mean=b.m_mean + 1e-6),
+        "calibration": lambda c: msgspec.structs.replace(c, thresholds={k: v + 1e-6 for k, v in c.thresholds.items()}),
+        "conformity": lambda c: msgspec.structs.replace(c, scores={**c.scores, "none": [0.0]}),
+    }[kind]
+    held[key] = changed(held[key])
+    write_fits(path, fits)
+    with pytest.raises(ValueError, match=f"the {kind} .* is another now"):
+        knowledge.renewed(path, [entry], [suite], 1, 0)

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
-from fdi_gym.diagnosis.fitting import FLOOR, VALIDATION_SEED
+from fdi_gym.diagnosis.fitting import VALIDATION_SEED, floored
 from fdi_gym.estimation.augmented import augmented, on_lines
 from fdi_gym.estimation.belief import Belief, fault_inputs
 from fdi_gym.estimation.decision import Reading, Rule, by_candidate
@@ -59,9 +59,8 @@ class Onsets(NamedTuple):
 
 def on_model(plant: Plant, belief: Belief) -> Belief:
     """The belief with the declared noises alone: the errors of the model are estimated, not covered by noise."""
-    Q = plant.Q.copy()
-    Q[np.diag_indices_from(Q)] += np.where(np.diag(Q) > 0, 0.0, (FLOOR * np.array([s.scale for s in plant.states])) ** 2)
-    return msgspec.structs.replace(belief, Q=Q, R=plant.R[np.ix_(belief.sensors, belief.sensors)])
+    R = plant.R[np.ix_(belief.sensors, belief.sensors)]
+    return msgspec.structs.replace(belief, Q=floored(plant, plant.Q), R=R)
 
 
 def merged(log: Array, X: Array, P: Array) -> tuple[Array, Array, Array]:

@@ -33,7 +33,7 @@ def fit(
         output: Folder that gets PLANT.json. Default: `fits` in the package of the methods, whence they are read.
         renew: The plant's file has changed and its flights should not have: find some of the fits anew, and where they are
             the same bytes write the present digest of the code into the file.
-        count: So many beliefs and calibrations are found anew then.
+        count: So many beliefs, calibrations and conformities are found anew then.
         seed: Which ones. Default: drawn anew each time.
         backend: Where they run: "loky" is this machine; dask, ray and slurm are clusters that exist.
         cluster: What the cluster is told, as name and value in turn: address HOST:PORT, or parameters of submitit.

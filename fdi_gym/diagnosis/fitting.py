@@ -31,6 +31,12 @@ SAMPLES = 100_000  # about so many samples are flown, in 20 to 60 flights
 CHANNEL_FLIGHTS, QUANTILE = 100, 0.99  # of channels: this quantile, over so many healthy flights, of the largest magnitude
 
 
+def floored(plant: Plant, Q: Array) -> Array:
+    """The process noise Q (n_x, n_x), a little of it where a state has none."""
+    floor = (FLOOR * np.array([s.scale for s in plant.states])) ** 2
+    return Q + np.diag(np.where(np.diag(Q) > 0, 0.0, floor))
+
+
 def flights_of(plant: Plant, process: str, first: int, count: int, faults: bool) -> tuple[list[FaultScenario], Record]:
     """Flights of a process, with the validation seeds from VALIDATION_SEED + first on; healthy ones if asked."""
     scenarios = [draw(plant.process(process), VALIDATION_SEED + first + i) for i in range(count)]
@@ -137,8 +143,7 @@ def fit_belief(plant: Plant, process: str) -> Belief:
 
     valid = np.arange(K) < record.length[:, None]
     dx, dy = _model_error(plant, healthy, record, valid)
-    Q = plant.Q + long_run(dx, valid, block)
-    Q[np.diag_indices_from(Q)] += np.where(np.diag(Q) > 0, 0.0, (FLOOR * scale) ** 2)
+    Q = floored(plant, plant.Q + long_run(dx, valid, block))
     R = (plant.R + long_run(dy, valid, block))[np.ix_(sensors, sensors)]
     P0 = np.diag((START * scale) ** 2 + ((record.state[:, 0] - plant.trim_state) ** 2).mean(axis=0))
 

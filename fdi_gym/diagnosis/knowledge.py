@@ -243,7 +243,7 @@ def renewed(path: Path, entries: Sequence[Entry], suites: Sequence[Any], count: 
     Args:
         path: The file.
         entries, suites: Methods, and suites of the plant, for which there are fits in it.
-        count: So many beliefs and calibrations are found anew, drawn at random, and compared to the byte.
+        count: So many beliefs, calibrations and conformities are found anew, drawn at random, and compared to the byte.
         seed: Of that draw.
 
     Raises:
@@ -255,6 +255,7 @@ def renewed(path: Path, entries: Sequence[Entry], suites: Sequence[Any], count: 
     rng = np.random.default_rng(seed)
     for kind, by_key, held in (
         ("belief", beliefs, fits.beliefs), ("calibration", tasks, fits.calibrations),
+        ("conformity", tasks, fits.conformities),
     ):  # fmt: skip
         there = sorted(key for key in by_key if key in held)
         for key in rng.permutation(there)[:count].tolist():
@@ -262,6 +263,8 @@ def renewed(path: Path, entries: Sequence[Entry], suites: Sequence[Any], count: 
             believed = fits.beliefs.get(belief_key(task.plant, task.process))
             if kind == "belief":
                 found: Any = fit_belief(task.plant, task.process)
+            elif kind == "conformity":
+                found = fit_conformity(task.entry, task.plant, task.process, task.settings)
             else:
                 found = fit_calibration(
                     task.entry, task.plant, task.process, task.settings, believed if task.entry.takes("belief") else None
