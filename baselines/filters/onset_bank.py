@@ -38,7 +38,7 @@ from fdi_gym.plant import Array, NotApplicableError, Plant
 FIRST, DRAWN = 700_000, 2000  # scenarios from VALIDATION_SEED + FIRST on
 GRID = 200  # onsets in a flight, where it is not said how far they are apart
 NEVER = -1e300  # log weight of a place where nothing is
-NEGLIGIBLE = -30.0  # log weight, as a share of all, below which a filter is given up
+NEGLIGIBLE = -1000.0  # log weight, as a share of all, below which a filter is given up: at -100 some still come back
 
 
 class Onsets(NamedTuple):
