@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
+import shlex
 import subprocess
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
@@ -18,6 +20,7 @@ import msgspec
 import numpy as np
 
 from baselines.learned.features import FeatureModel, FeatureShape
+from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.files import RefusedError, read_bytes, read_json, write_whole
 from fdi_gym.plant import Array, NotApplicableError, Plant
 
@@ -148,7 +151,12 @@ def stem(method: str, plant: Plant) -> str:
 
 def command(method: str, plant: Plant, budget: int | None, seed: int) -> str:
     """What to type to train the same weights again."""
-    parts = ["fdi-gym train", method, plant.id, "" if plant.bare is None else "--options sensor_faults true",
+    usual = load_plant(plant.id).options if plant.id in plant_sources() else {}
+    options = [
+        f"{name} {shlex.quote(value if isinstance(value, str) else json.dumps(value))}"
+        for name, value in plant.options.items() if name not in usual or usual[name] != value
+    ]  # fmt: skip
+    parts = ["fdi-gym train", method, plant.id, "--options" if options else "", *options,
              f"--budget {budget}" if budget else "", f"--seed {seed}" if seed else ""]  # fmt: skip
     return " ".join(part for part in parts if part)
 
