@@ -160,13 +160,14 @@ def information(
     Outputs that were not heard (..., n_y) have no residual, and no fault shows in them.
     """
     r = y - expected(model, phi)
-    if heard is None or heard.all():
-        e = r @ model.whiten.T.astype(float)
-        S = psi @ np.einsum("ab,jbx->xaj", model.whiten, model.V).astype(float).reshape(psi.shape[-1], -1)
-        S = S.reshape(*psi.shape[:-1], len(model.whiten), len(model.V))
-    else:
-        e = (r * heard) @ model.whiten.T.astype(float)
-        S = model.whiten @ (heard[..., None] * np.einsum("jbx,...x->...bj", model.V, psi))
+    e = r @ model.whiten.T.astype(float)
+    S = psi @ np.einsum("ab,jbx->xaj", model.whiten, model.V).astype(float).reshape(psi.shape[-1], -1)
+    S = S.reshape(*psi.shape[:-1], len(model.whiten), len(model.V))
+    if heard is not None and not heard.all():
+        some = ~heard.all(axis=-1)  # of the others nothing changes, whichever they are in a batch with
+        there = heard[some]
+        e[some] = (r[some] * there) @ model.whiten.T.astype(float)
+        S[some] = model.whiten @ (there[..., None] * np.einsum("jbx,...x->...bj", model.V, psi[some]))
     St = np.swapaxes(S, -1, -2)
     return e, (St @ e[..., None])[..., 0], St @ S
 
