@@ -14,17 +14,16 @@ from pathlib import Path
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[name] = "1"
 
+import msgspec
 import numpy as np
 from sections import sections_of, write_sections
 
-from fdi_gym.diagnosis import find_diagnoser, find_trainer, make_diagnoser, run
+from fdi_gym.diagnosis import find_trainer
 from fdi_gym.discovery import load_plant
-from fdi_gym.metrics import outcome
-from fdi_gym.scores import summarise
+from fdi_gym.evaluation import evaluate
 from fdi_gym.suite import ActingSuite, load_suite, suite_names
 from fdi_gym.tables import markdown
 
-BLOCK = 100  # flights that are flown together
 PROCESSES = ("standard", "hard")
 INTRODUCTION = """# Other seeds of training
 
@@ -35,24 +34,18 @@ equal. Where the seeds differ by more than that, a difference between two networ
 """
 
 
-def suites_of(plant_id):
+def suites_of(plant):
     """The suites of a plant with the processes that networks are trained on, at its usual options."""
-    for name in suite_names():
-        suite = load_suite(name)
-        usual = suite.plant == plant_id and suite.options == dict(load_plant(plant_id).options)
+    for suite in map(load_suite, suite_names()):
+        usual = suite.plant == plant.id and suite.options == dict(plant.options)
         if usual and suite.process in PROCESSES and suite.mismatch is None and not isinstance(suite, ActingSuite):
             yield suite
 
 
-def score(suite, plant, method, path):
-    """Balanced accuracy per sample with its interval."""
-    outcomes, scoring = [], plant.process(suite.process).scoring
-    for first in range(0, suite.episodes, BLOCK):
-        record = suite.record(plant, range(first, min(first + BLOCK, suite.episodes)))
-        expects = {"process": suite.process} if "process" in find_diagnoser(method).build.__annotations__ else {}
-        said = run(make_diagnoser(method, plant, path=str(path), **expects), record.obs)
-        outcomes += [outcome(plant, scoring, record, said, i) for i in range(len(record.length))]
-    found = summarise(outcomes, len(plant.labels), [s.name for s in plant.estimated], plant.dt)["per_sample"]
+def score(suite, method, path, work):
+    """Balanced accuracy per sample of these weights, with its interval."""
+    told = msgspec.structs.replace(suite, settings={method: {"path": str(path.resolve())}})
+    found = evaluate(told, [method], work=work, jobs=1, progress=False)[method].row.metrics["per_sample"]
     return found["balanced_accuracy"], found["balanced_accuracy_interval"]
 
 
@@ -66,12 +59,12 @@ def main():
     parser.add_argument("--page", type=Path, default=Path("leaderboards/learning/seeds.md"))
     arguments = parser.parse_args()
     plant, rows = load_plant(arguments.plant), []
-    suites = list(suites_of(plant.id))
+    suites = list(suites_of(plant))
     for method in arguments.methods:
         trainer, found = find_trainer(method), []
         for seed in range(arguments.seeds):
             path = trainer.build(plant, budget=arguments.budget, seed=seed, work=arguments.work)
-            found.append([score(suite, suite.build(), method, path) for suite in suites])
+            found.append([score(suite, method, path, arguments.work) for suite in suites])
             print(method, seed, *(f"{suite.name} {100 * s:.1f}" for suite, (s, _) in zip(suites, found[-1], strict=True)),
                   flush=True)  # fmt: skip
         for suite, per_seed in zip(suites, zip(*found, strict=True), strict=True):

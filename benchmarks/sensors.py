@@ -11,16 +11,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from learning_page import LEARNED, best
 from sections import share, write_sections
 
-from fdi_gym.diagnosis import diagnosers
 from fdi_gym.leaderboard import read_board
 from fdi_gym.sensors import KINDS
 from fdi_gym.suite import load_suite
 from fdi_gym.tables import ceiling, clairvoyant, markdown
 
 ALL, OWN, HEALTHY = "All plants", "the plant's own", "healthy"
-LEARNED = "baselines.learned."
 INTRODUCTION = """# Sensors that fail
 
 Written by `python benchmarks/sensors.py` from the rows of the suites `*-mixed`: half of the faulty flights have a sensor's
@@ -79,16 +78,11 @@ def by_kind(plant, scenarios, outcomes):
     return found
 
 
-def best_of(rows):
-    """The row with the highest balanced accuracy; None of none."""
-    return max(rows, key=lambda row: row.metrics["per_sample"]["balanced_accuracy"], default=None)
-
-
 def shown(board):
     """The best filter, the best learned method and the highest ceiling of a board, where it has them."""
-    learned = [r for r in board.honest() if diagnosers()[r.diagnoser].build.__module__.startswith(LEARNED)]
-    filters = [r for r in board.honest() if r not in learned]
-    return [row for row in (best_of(filters), best_of(learned), board.top()) if row]
+    learned = [row for row in board.honest() if row.diagnoser in LEARNED]
+    filters = [row for row in board.honest() if row.diagnoser not in LEARNED]
+    return [row for row in (best(filters), best(learned), board.top()) if row]
 
 
 def summary(board, found):

@@ -669,7 +669,8 @@ def committed():
 
 def test_committed_rows_are_small():
     for path in committed():
-        assert path.stat().st_size < 30_000  # of 26 labels, two confusion matrices
+        large = path.parent.name == "cmg-mixed"  # two confusion matrices of 26 labels
+        assert path.stat().st_size < (30_000 if large else 20_000)
         assert outcomes_path(path).stat().st_size < 400_000
 
 

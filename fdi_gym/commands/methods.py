@@ -59,7 +59,7 @@ def fit(
         for path in {(package_of(entry) or Path()) / "fits" / f"{plant_id}.json" for entry in entries}:
             seed = secrets.randbits(32) if seed is None else seed
             knowledge.write_fits(path, knowledge.renewed(path, entries, asked, count, seed))
-            print(f"{count} beliefs and {count} calibrations (seed {seed}) are the same bytes; {path} is of this code now")
+            print(f"up to {count} fits of each kind (seed {seed}) are the same bytes; {path} is of this code now")
         return
     with on(backend, cluster):
         fits = knowledge.fit_suites(entries, asked, jobs)
