@@ -71,7 +71,9 @@ def home(tmp_path_factory):
     sys.path.insert(0, str(folder))
     names = [MEMORISER, HONEST, "null"]
     write_rows(folder / "results", suite, evaluate(suite, names, work=folder / "work", jobs=1, progress=False))
-    rounds.seal("first", suite, folder, episodes=24)
+    with pytest.MonkeyPatch.context() as patch:  # the same flights each time: of 24 others one interval in twenty errs
+        patch.setattr(rounds.secrets, "randbelow", lambda below: below // 3)
+        rounds.seal("first", suite, folder, episodes=24)
     yield folder
     sys.path.remove(str(folder))
 
@@ -82,15 +84,14 @@ def revealed(home, **arguments):
                          **arguments)  # fmt: skip
 
 
-def test_a_method_that_knows_the_public_flights_falls_outside_its_interval(home):
+def test_a_method_that_knows_the_public_flights_loses_on_others(home):
     found = revealed(home)
     assert not found.refused
     lost = rounds.losses(found.methods, "per_sample")
     rows = {pair.public.diagnoser: pair for pair in found.methods}
     for name in (MEMORISER, HONEST, "null"):
         public, sealed = (row.metrics["per_sample"] for row in rows[name])
-        low, high = public["balanced_accuracy_interval"]
-        assert (low <= sealed["balanced_accuracy"] <= high) == (name != MEMORISER)
+        assert (lost[name].low <= 0 <= lost[name].high) == (name != MEMORISER)
         assert lost[name].real == (name == MEMORISER)
         assert lost[name].value == pytest.approx(public["balanced_accuracy"] - sealed["balanced_accuracy"])
     assert rows[MEMORISER].public.metrics["per_sample"]["balanced_accuracy"] == 1.0
