@@ -9,7 +9,6 @@ from conftest import build
 from fdi_gym.diagnosis import NotApplicableError, diagnosers, find_diagnoser, make_diagnoser, run
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import simulate
-from fdi_gym.estimation.decision import Reading
 from fdi_gym.estimation.sensor_checks import MEMORY, REPEATED, SensorChecks
 from fdi_gym.faults import Abrupt, Fault, Ramp, draw
 from fdi_gym.sensors import KINDS, of_kind, sensor_mode
@@ -167,23 +166,18 @@ def test_the_laws_of_diagnosers_hold_where_sensors_may_fail(name):
 # The checks themselves
 
 
-def readings_of(plant, nu, S):
-    return Reading(nu=nu, S=np.broadcast_to(S, (len(nu), *S.shape)))
-
-
 def test_a_reading_that_comes_again_counts_and_one_at_the_end_of_the_range_does_not():
     plant, checks = sick(), SensorChecks(sick())
     s, seen = checks.start(1), np.ones((1, 4), bool)
     row = np.array([[1.0, 2.0, plant.outputs[2].high, 4.0]])
-    nothing = Reading()
     for k in range(4):
         y = row + np.array([[0.0, k, 0.0, k]])
-        s = checks.update(s, y, seen, nothing)
+        s = checks.update(s, y, seen, None, None)
     gain = checks.gain(s)[0]
     names = [label.name for label in plant.labels]
     assert gain[names.index(sensor_mode("beta"))] == 3 * REPEATED
     assert gain.sum() == 3 * REPEATED
-    unseen = checks.update(s, row * 0, np.zeros((1, 4), bool), nothing)
+    unseen = checks.update(s, row * 0, np.zeros((1, 4), bool), None, None)
     assert np.array_equal(checks.gain(unseen), checks.gain(s))  # what did not report says nothing
 
 
@@ -196,7 +190,7 @@ def test_noise_that_grows_is_seen_and_a_bias_is_not(factor):
         nu = 0.2 * rng.standard_normal((n, 4))
         nu[:, 0] *= factor
         nu[:, 1] += 0.2 * 5  # a bias that stays
-        s = checks.update(s, rng.standard_normal((n, 4)), seen, readings_of(plant, nu, S))
+        s = checks.update(s, rng.standard_normal((n, 4)), seen, nu, np.broadcast_to(S, (n, 4, 4)))
     gain = checks.gain(s)
     names = [label.name for label in plant.labels]
     beta, p = names.index(sensor_mode("beta")), names.index(sensor_mode("p"))

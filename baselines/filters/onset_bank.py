@@ -309,5 +309,5 @@ def onset_bank(
         raise ValueError(f"every is a sample or more, not {every}")
     events = events_of_process(plant, process, courses, sizes)
     bank = Bank(plant, belief, events, onsets, max(1, len(events.onset) // GRID) if every is None else every)
-    filter = Filter(bank.start, bank.predict, bank.update, bank.read, expect=bank.expect)
+    filter = Filter(bank.start, bank.predict, bank.update, bank.read, expect=bank.expect, innovation=lambda s: (s.nu, s.S))
     return diagnoser_of(plant, filter, most_telling(events))

@@ -91,5 +91,8 @@ def told_events_oracle(
     def read(s: Told) -> Reading:
         return bank.read(s.bank)
 
-    filter = Filter(start, predict, update, read, expect=lambda s, at: bank.expect(s.bank, at))
+    filter = Filter(
+        start, predict, update, read, expect=lambda s, at: bank.expect(s.bank, at),
+        innovation=lambda s: (s.bank.nu, s.bank.S),
+    )  # fmt: skip
     return diagnoser_of(plant, filter, most_telling(events))

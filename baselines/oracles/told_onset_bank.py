@@ -140,7 +140,8 @@ def told_bank(
     """
     bank = _Told(plant, r, scenarios, course, allowed)
     rule = by_candidate(lambda reading, label: np.argmax(np.asarray(reading.probs), axis=1), 1)
-    return diagnoser_of(plant, Filter(bank.start, bank.predict, bank.update, bank.read, expect=bank.expect), rule)
+    filter = Filter(bank.start, bank.predict, bank.update, bank.read, expect=bank.expect, innovation=lambda s: (s.nu, s.S))
+    return diagnoser_of(plant, filter, rule)
 
 
 class _Told:
@@ -224,7 +225,7 @@ class _Told:
         found = s._replace(X=X, P=P, nu=nu, S=S, log=log)
         if self.checks is None or s.checks is None:
             return found
-        return found._replace(checks=self.checks.update(s.checks, y, seen, Reading(nu=nu, S=S)))
+        return found._replace(checks=self.checks.update(s.checks, y, seen, nu, S))
 
     def by_label(self, s: Bank, log: Array) -> Array:
         """Log likelihood (n, labels) of each label that can be, on average over its hypotheses."""
@@ -245,8 +246,8 @@ class _Told:
         model, log = self.r.model, s.log + self.r.log_prior
         by_label = self.by_label(s, log)
         probs = np.exp(by_label - logsumexp(by_label, axis=1, keepdims=True))
-        weight = np.exp(log - logsumexp(log[:, 1:], axis=1, keepdims=True)) * s.now[:, None]
-        weight[:, 0] = 0.0
+        weight = np.zeros_like(log)
+        weight[:, 1:] = np.exp(log[:, 1:] - logsumexp(log[:, 1:], axis=1, keepdims=True)) * s.now[:, None]
         deviation = s.length[..., None] * (self.offset + (self.direction @ s.X[..., model.z, None])[..., 0])
         mean = (weight[..., None] * deviation).sum(axis=1)[:, : self.own]
         return Reading(mean, x=s.X[:, 0, model.x], nu=s.nu, S=s.S, probs=probs)

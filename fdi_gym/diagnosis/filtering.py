@@ -42,6 +42,7 @@ class Filter(NamedTuple):
     begin: Callable[[Any, Interval, Array], Any] | None = None  # (start, interval, y)
     needs: Array | None = None  # (n_y,) bool, for `begin`. Default: all sensors
     expect: Callable[[Any, Interval], Array] | None = None  # what the sensors will read (n, n_y); NaN where that is open
+    innovation: Callable[[Any], tuple[Array, Array]] | None = None  # nu and S of the reading, where that is cheaper
 
 
 class Running(NamedTuple):
@@ -131,9 +132,15 @@ def checked(plant: Plant, filter: Filter) -> Filter:
     """The filter, whose readings say too what its sensors show of their own faults."""
     checks = SensorChecks(plant)
 
+    def innovation(state: Any) -> tuple[Array | None, Array | None]:
+        if filter.innovation is not None:
+            return filter.innovation(state)
+        reading = filter.read(state)
+        return reading.nu, reading.S
+
     def update(s: Checked, at: Interval, y: Array, seen: Array) -> Checked:
         state = filter.update(s.filter, at, y, seen)
-        return Checked(state, checks.update(s.checks, y, seen, filter.read(state)))
+        return Checked(state, checks.update(s.checks, y, seen, *innovation(state)))
 
     begin, expect = filter.begin, filter.expect
     return filter._replace(

@@ -162,6 +162,19 @@ def moments_of_points(rule, U, low, values, first, mean, cross, cov):
 
 
 @helper
+def enters(moving, integers, direction, j):
+    """Whether f (moving) or h depends on entry j of X at all: a magnitude may move the sensors alone, or nothing."""
+    n_x, n_theta, p, own = integers[4], integers[6], integers[8], integers[11]
+    if j < n_x or j >= n_x + direction.shape[1]:
+        return True
+    for e in range(p):
+        sensors = own <= integers[SIZES + e] < n_theta
+        if direction[e, j - n_x] != 0.0 and not (moving and sensors):
+            return True
+    return False
+
+
+@helper
 def through(rule, moving, integers, reals, step, offset, direction, t, X, P, u, known, mean, cross, cov):
     """N(X, P) through f (moving) or h: mean (m,), cov (m, m) and cross (m, N) with what went in."""
     N, m = X.size, mean.size
@@ -174,18 +187,31 @@ def through(rule, moving, integers, reals, step, offset, direction, t, X, P, u, 
         low = integers[4] if moving else 0  # of f, nobody asks for the covariance with x before
         moments_of_points(rule, U, low, values, first, mean, cross, cov)
         return
-    spread(X, np.diag(step), 1.0, points)
-    pass_points(moving, integers, reals, offset, direction, t, points, u, known, values)
+    moved = 0  # columns that are not 0
     for j in range(N):
-        for a in range(m):
-            first[j, a] = (values[1 + j, a] - values[1 + N + j, a]) * (0.5 / step[j])
+        if enters(moving, integers, direction, j):
+            for i in range(N):
+                points[1 + 2 * moved, i] = points[2 + 2 * moved, i] = X[i]
+            points[1 + 2 * moved, j] += step[j]
+            points[2 + 2 * moved, j] -= step[j]
+            moved += 1
+    points[0] = X
+    pass_points(moving, integers, reals, offset, direction, t, points[: 1 + 2 * moved], u, known, values)
     for a in range(m):
         mean[a] = values[0, a]
         for i in range(N):
             cross[a, i] = 0.0
-        for j in range(N):
-            for i in range(N):
-                cross[a, i] += first[j, a] * P[j, i]
+    moved = 0
+    for j in range(N):
+        for a in range(m):
+            first[j, a] = 0.0
+        if enters(moving, integers, direction, j):
+            for a in range(m):
+                first[j, a] = (values[1 + 2 * moved, a] - values[2 + 2 * moved, a]) * (0.5 / step[j])
+                for i in range(N):
+                    cross[a, i] += first[j, a] * P[j, i]
+            moved += 1
+    for a in range(m):
         for b in range(a + 1):
             cov[a, b] = 0.0
         for i in range(N):
@@ -197,18 +223,23 @@ def through(rule, moving, integers, reals, step, offset, direction, t, X, P, u, 
 
 @helper
 def through_matrix(F, P, cross, cov):
-    """cross = F P and cov = F P F' for F (m, N)."""
+    """cross = F P and cov = F P F' for F (m, N), most of which may be 0."""
     m, N = F.shape
     for a in range(m):
         for i in range(N):
             cross[a, i] = 0.0
         for j in range(N):
-            for i in range(N):
-                cross[a, i] += F[a, j] * P[j, i]
-        for b in range(a + 1):
+            if F[a, j] != 0.0:
+                for i in range(N):
+                    cross[a, i] += F[a, j] * P[j, i]
+    for b in range(m):
+        for a in range(b, m):
             cov[a, b] = 0.0
-            for j in range(N):
-                cov[a, b] += cross[a, j] * F[b, j]
+        for j in range(N):
+            if F[b, j] != 0.0:
+                for a in range(b, m):
+                    cov[a, b] += cross[a, j] * F[b, j]
+        for a in range(b, m):
             cov[b, a] = cov[a, b]
 
 

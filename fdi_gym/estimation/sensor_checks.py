@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi_gym.estimation.belief import noisy_sensors
-from fdi_gym.estimation.decision import Reading
 from fdi_gym.plant import Array, Plant
 from fdi_gym.sensors import sensor_mode
 
@@ -53,19 +52,19 @@ class SensorChecks:
         m = len(self.sensors)
         return Checks(np.full((n, m), np.nan), np.zeros((n, m)), np.full((n, m), np.nan), np.ones((n, m)))
 
-    def update(self, s: Checks, y: Array, seen: Array, r: Reading) -> Checks:
-        """After a sample: y and seen (n, n_y), and what the filter makes of it."""
+    def update(self, s: Checks, y: Array, seen: Array, innovation: Array | None, S: Array | None) -> Checks:
+        """After a sample: y and seen (n, n_y), and the filter's innovation with its covariance, where it has one."""
         y, seen = y[:, self.sensors], seen[:, self.sensors]
         inside = (y > self._ends[0]) & (y < self._ends[1])
         repeats = np.where(seen, np.where((y == s.y) & inside, s.repeats + 1.0, 0.0), s.repeats)
         nu, square = s.nu, s.square
-        if r.nu is not None and r.S is not None and r.nu.shape == y.shape:
-            variance = np.einsum("nmm->nm", r.S)
+        if innovation is not None and S is not None and innovation.shape == y.shape:
+            variance = np.einsum("nmm->nm", S)
             with np.errstate(invalid="ignore", divide="ignore"):
-                change = (r.nu - s.nu) ** 2 / (2.0 * variance)
+                change = (innovation - s.nu) ** 2 / (2.0 * variance)
             use = seen & np.isfinite(change)
             square = np.where(use, square + (np.minimum(change, MOST) - square) / MEMORY, square)
-            nu = np.where(seen, r.nu, s.nu)
+            nu = np.where(seen, innovation, s.nu)
         return Checks(np.where(seen, y, s.y), repeats, nu, square)
 
     def gain(self, s: Checks) -> Array:
