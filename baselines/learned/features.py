@@ -239,9 +239,11 @@ class Stream(NamedTuple):
 def begin(plant: Plant, shape: FeatureShape, n: int) -> Stream:
     """The state before the first sample."""
     p, M, width = len(plant.estimated), len(MEMORIES), len(plant.observed)
+    count, total, when, last, newest, means = np.zeros((6, n, width))
     return Stream(
-        *np.zeros((5, n, width)), np.zeros((n, shape.lags, 2, width)), np.zeros(n, np.int64),
-        np.zeros((n, M, p)), np.zeros((n, M, p, p)), np.zeros(n), np.zeros((n, width)), np.zeros((n, len(plant.outputs))),
+        count=count, total=total, when=when, last=last, newest=newest, past=np.zeros((n, shape.lags, 2, width)),
+        filled=np.zeros(n, np.int64), g=np.zeros((n, M, p)), info=np.zeros((n, M, p, p)), blocks=np.zeros(n), means=means,
+        residuals=np.zeros((n, len(plant.outputs))),
     )  # fmt: skip
 
 
@@ -287,10 +289,11 @@ def _close_block(plant: Plant, shape: FeatureShape, model: FeatureModel, stream:
     e, g, info = information(model, phi, psi, now[:, 0, :n_y], heard[:, :n_y])
     ready = (stream.filled >= shape.lags).astype(float)
     keep = (1 - 1 / MEMORIES)[:, None]
+    count, total, when, last = (np.zeros_like(stream.total) for _ in range(4))
     return Stream(
-        *np.zeros((4, *stream.total.shape)), now[:, 1],
-        np.concatenate([now[:, None], stream.past[:, :-1]], axis=1), stream.filled + 1,
-        keep * stream.g + (g * ready[:, None])[:, None],
-        keep[..., None] * stream.info + (info * ready[:, None, None])[:, None],
-        stream.blocks + 1, stream.means + now[:, 0], stream.residuals + e * ready[:, None],
+        count=count, total=total, when=when, last=last, newest=now[:, 1],
+        past=np.concatenate([now[:, None], stream.past[:, :-1]], axis=1), filled=stream.filled + 1,
+        g=keep * stream.g + (g * ready[:, None])[:, None],
+        info=keep[..., None] * stream.info + (info * ready[:, None, None])[:, None],
+        blocks=stream.blocks + 1, means=stream.means + now[:, 0], residuals=stream.residuals + e * ready[:, None],
     )  # fmt: skip

@@ -230,7 +230,7 @@ class _Told:
     def by_label(self, s: Bank, log: Array) -> Array:
         """Log likelihood (n, labels) of each label that can be, on average over its hypotheses."""
         labels = len(self.plant.labels)
-        found = logsumexp(np.where(self.r.label == np.arange(labels)[:, None], log[:, None], -np.inf), axis=2)
+        found = np.asarray(logsumexp(np.where(self.r.label == np.arange(labels)[:, None], log[:, None], -np.inf), axis=2))
         found[:, 0] = -np.inf
         if self.checks is not None and s.checks is not None:
             gain = self.checks.repeated(s.checks)
