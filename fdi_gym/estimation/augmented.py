@@ -50,9 +50,9 @@ class AugmentedModel:
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
 
-    def on(self, offset: Array, direction: Array) -> AugmentedModel:
-        """The model of other lines: offsets (r, p) and directions (r, p, f) of as many magnitudes."""
-        found = self.replace(lines=(offset, direction))
+    def on(self, offset: Array, direction: Array, Q: Array | None = None) -> AugmentedModel:
+        """The model of other lines: offsets (r, p) and directions (r, p, f) of as many magnitudes, and Q (r, N, N)."""
+        found = self.replace(lines=(offset, direction), Q=self.Q if Q is None else Q)
         bound = self.compiled
         constants = (*bound.constants[:3], contiguous(offset), contiguous(direction))
         found.__dict__["compiled"] = bound._replace(constants=constants)
