@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from sections import sections_of, write_sections
 
-from fdi_gym.diagnosis import find_trainer
+from fdi_gym.diagnosis import train
 from fdi_gym.discovery import load_plant
 from fdi_gym.evaluation import evaluate
 from fdi_gym.suite import ActingSuite, load_suite, suite_names
@@ -28,7 +28,7 @@ PROCESSES = ("standard", "hard")
 INTRODUCTION = """# Other seeds of training
 
 Written by `python benchmarks/seeds.py`. Each network is trained anew with several seeds: other initial weights, other
-training flights. All are scored on the suites' flights; balanced accuracy per sample in percent, and its standard deviation
+training flights. `residual_net` starts from the `sequence_net` of its seed. All are scored on the suites' flights; balanced accuracy per sample in percent, and its standard deviation
 over the seeds. The interval is that of the first seed's score: how sure it is for the flights of the suite, all other things
 equal. Where the seeds differ by more than that, a difference between two networks is no difference between two methods.
 """
@@ -61,9 +61,9 @@ def main():
     plant, rows = load_plant(arguments.plant), []
     suites = list(suites_of(plant))
     for method in arguments.methods:
-        trainer, found = find_trainer(method), []
+        found = []
         for seed in range(arguments.seeds):
-            path = trainer.build(plant, budget=arguments.budget, seed=seed, work=arguments.work)
+            path = train(method, plant, budget=arguments.budget, seed=seed, work=arguments.work)
             found.append([score(suite, method, path, arguments.work) for suite in suites])
             print(method, seed, *(f"{suite.name} {100 * s:.1f}" for suite, (s, _) in zip(suites, found[-1], strict=True)),
                   flush=True)  # fmt: skip

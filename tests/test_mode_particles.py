@@ -71,6 +71,8 @@ def test_with_all_histories_it_is_bayes_rule(bank):
         at = interval(plant, k, u[k])
         s = f.update(f.predict(s, at), at, y[k], seen)
     read = f.read(s)
+    assert read.probs is not None
+    assert read.x is not None
 
     model, z = b.model, b.model.z
     Pi = every * b.transition
@@ -125,6 +127,7 @@ def test_more_particles_are_no_worse_and_a_fault_is_named():
     for count in (4, 64):
         said = run(make_diagnoser("mode_particles", plant, particles=count), record.obs)
         right[count] = (said.label[:, -1] == record.label[:, -1]).mean()
+        assert said.label_probs is not None
         np.testing.assert_allclose(said.label_probs.sum(axis=-1), 1.0)
     assert right[64] >= max(right[4], 0.85)
 

@@ -158,7 +158,7 @@ def mode_particles(plant: Plant, belief: Belief, calibration: Calibration, parti
     rate = particles * (1 + 2 * len(b.model.scale)) / plant.dt
     if rate > MOST:
         raise NotApplicableError(
-            f"{particles} particles cost too much: {rate:.0f} evaluations of the model of {plant.id} a second of flight, where "
-            f"{MOST:.0f} are allowed"
+            f"{particles} particles cost too much: {rate:.0f} evaluations of the model of {plant.id} a second of flight, "
+            f"where {MOST:.0f} are allowed"
         )
     return diagnoser_of(plant, particle_filter(b, particles, every), by_labels(plant, calibration))
