@@ -28,9 +28,10 @@ PROCESSES = ("standard", "hard")
 INTRODUCTION = """# Other seeds of training
 
 Written by `python benchmarks/seeds.py`. Each network is trained anew with several seeds: other initial weights, other
-training flights. `residual_net` starts from the `sequence_net` of its seed. All are scored on the suites' flights; balanced accuracy per sample in percent, and its standard deviation
-over the seeds. The interval is that of the first seed's score: how sure it is for the flights of the suite, all other things
-equal. Where the seeds differ by more than that, a difference between two networks is no difference between two methods.
+training flights; `residual_net` starts from the `sequence_net` of its seed. All are scored on the suites' flights; balanced
+accuracy per sample in percent, and its standard deviation over the seeds. The interval is that of the first seed's score:
+how sure it is for the flights of the suite, all other things equal. Where the seeds differ by more than that, a difference
+between two networks is no difference between two methods.
 """
 
 
