@@ -29,7 +29,7 @@ from benchmarks.reproduction.claims import (
 )
 from benchmarks.reproduction.comparison import Comparisons
 from benchmarks.reproduction.missile_pitch.measure import numbered, unclipped
-from benchmarks.reproduction.pieces import finished, keep, kept, pieces, reference, rounded
+from benchmarks.reproduction.pieces import command, finished, keep, kept, pieces, reference
 from fdi_gym.files import read_json
 from fdi_gym.suite import load_suite, suite_names
 
@@ -90,6 +90,14 @@ def test_a_page_of_no_pieces_is_refused(tmp_path, monkeypatch):
     with pytest.raises(SystemExit, match="no piece is finished"):
         runpy.run_module("benchmarks.reproduction.huav_hover", run_name="__main__")
     assert not list(tmp_path.rglob("*.md"))
+
+
+def test_another_machine_goes_on_with_what_the_page_lacks(tmp_path, monkeypatch):
+    keep(tmp_path, "some", {"a/0": "of the other machine"})
+    monkeypatch.setattr(sys, "argv", ["-", "--missing", "--workers", "1", "--work", str(tmp_path), "--pages", str(tmp_path)])
+    command("some", lambda quick: {f"a/{i}": (piece, (i,)) for i in (0, 1)}, lambda found, quick, path: None)
+    assert kept(tmp_path, "some") == {"a/0": "of the other machine", "a/1": {"number": 1, "never": None}}
+    assert not list(tmp_path.rglob("a_0.json"))
 
 
 PAGES = ROOT / "leaderboards" / "reproduction"

@@ -98,6 +98,8 @@ class Arguments:
     """Measure nothing: the page of the pieces that are finished, and of those that lie beside the page."""
     only: str = ""
     """Measure only the pieces whose name begins like this."""
+    missing: bool = False
+    """Measure only those that do not lie beside the page: to go on with what another machine has begun."""
     work: Path = Path("runs/reproduction")
     """Folder of the finished pieces."""
     pages: Path = Path("leaderboards/reproduction")
@@ -122,13 +124,15 @@ def command(plant: str, plan: Callable[[bool], Jobs], write: Callable[[Found, bo
     work = arguments.work / plant / ("quick" if arguments.quick else "full")
     pages = work if arguments.quick else arguments.pages
     jobs = plan(arguments.quick)
+    before = kept(pages, plant)
     mine = {name: job for name, job in jobs.items() if name.startswith(arguments.only)}
     if not mine:
         raise SystemExit(f"no piece begins with {arguments.only!r}")
+    if arguments.missing:
+        mine = {name: job for name, job in mine.items() if name not in before}
     if not arguments.page_only:
         with on(arguments.backend, arguments.cluster, arguments.work):
             pieces(work, mine, arguments.workers)
-    before = kept(pages, plant)
     found = Found({name: piece for name, piece in before.items() if name in jobs} | rounded(finished(work, jobs)))
     if not found:
         raise SystemExit(f"no piece is finished in {work}, and none lies in {pages}: leave out --page-only")
