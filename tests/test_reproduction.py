@@ -29,7 +29,7 @@ from benchmarks.reproduction.claims import (
 )
 from benchmarks.reproduction.comparison import Comparisons
 from benchmarks.reproduction.missile_pitch.measure import numbered, unclipped
-from benchmarks.reproduction.pieces import command, finished, keep, kept, pieces, reference
+from benchmarks.reproduction.pieces import command, finished, keep, kept, pieces, reference, rounded
 from fdi_gym.files import read_json
 from fdi_gym.suite import load_suite, suite_names
 
