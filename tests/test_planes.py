@@ -239,10 +239,8 @@ def test_the_estimates_of_gain_and_bias_are_as_sure_as_they_say(name):
     assert (np.abs(ratio) < 3).mean() > 0.85
 
 
-@pytest.mark.parametrize("name", GENERAL[2:])
+@pytest.mark.parametrize("name", GENERAL)
 def test_the_laws_of_diagnosers_hold_on_a_plane(name):
-    """Without the first two: after a gap they wait until they are as sure as before it, as a valve that has lost half of its
-    gain may never let them be (`decision.Waiting`)."""
     check_diagnoser(lambda p, s: make_diagnoser(name, p, scenarios=s), plane())
 
 

@@ -14,7 +14,8 @@ A rule is a pair of functions, `start(n)` and `step(state, k, reading, informed)
 `fdi_gym.estimation.channels` has one for filters whose estimate has an entry for each fault.
 
 A sample at which no sensor reported says nothing, and no counter moves. After a gap `by_labels` waits until the estimate is
-about as sure as before it: what a held command did to it while nothing was measured is no evidence of a fault.
+about as sure as before it: what a held command did to it while nothing was measured is no evidence of a fault. It waits in
+proportion to the gap, since a fault may have ended what makes the estimate sure.
 """
 
 from __future__ import annotations
@@ -166,6 +167,7 @@ def glr(windows: tuple[int, ...] = (2, 5, 10, 20, 40)) -> Statistic:
 STATISTICS: dict[str, Callable[[], Statistic]] = {"chi-square": chi_square, "cusum": cusum, "glr": glr}
 DECISIONS = ("distance", "thresholds", *STATISTICS)
 SURE_AGAIN = 1.2  # times the variance before a gap
+PATIENCE, PER_GAP = 20, 2  # it waits for so many samples at most, and so many more for each without a report
 QUARTER = 0.25  # of a typical fault: what LEAST is in the fixed metric of "thresholds"
 
 
@@ -174,17 +176,20 @@ QUARTER = 0.25  # of a typical fault: what LEAST is in the fixed metric of "thre
 
 
 class Waiting(NamedTuple):
-    """For an estimate that is as sure again as it was before a gap."""
+    """For an estimate that is as sure again as it was before a gap, or does not become so any more."""
 
     still: Array  # (n,) bool
     variance: Array  # (n, p) of the estimate when a sensor last reported and nothing was waited for
+    patience: Array  # (n,) samples with reports for which it is waited at most
 
     def after(self, informed: Array, variance: Array) -> Waiting:
         """After a sample at which sensors reported or did not."""
         if informed.all() and not self.still.any():
-            return Waiting(self.still, variance)
-        still = ~informed | (self.still & (variance > SURE_AGAIN * self.variance).any(axis=1))
-        return Waiting(still, np.where(still[:, None], self.variance, variance))
+            return Waiting(self.still, variance, self.patience)
+        unsure = (variance > SURE_AGAIN * self.variance).any(axis=1) & (self.patience > 0)
+        still = ~informed | (self.still & unsure)
+        patience = np.where(still, self.patience + np.where(informed, -1, PER_GAP), PATIENCE)
+        return Waiting(still, np.where(still[:, None], self.variance, variance), patience)
 
 
 def by_labels(
@@ -219,7 +224,7 @@ def by_labels(
     none, labels, (h, _, f) = np.zeros(0), len(plant.labels), sets.direction.shape
 
     def start(n: int) -> Any:  # the automata, the statistic, and what is waited for
-        return np.zeros((n, 5), np.int64), None, Waiting(np.zeros(n, bool), np.full((n, p), np.inf))
+        return np.zeros((n, 5), np.int64), None, Waiting(np.zeros(n, bool), np.full((n, p), np.inf), np.full(n, PATIENCE))
 
     def costs(r: Reading) -> tuple[Array, Array]:
         assert r.z is not None

@@ -69,9 +69,9 @@ def campaign(found: Found) -> str:
         "levels. "
         f"Measured here, on the slew: {done} flights of 1,500 in each cell ({len(there)} of {len(slew)} blocks, {CAMPAIGN} "
         "a cell). "
-        f"`{COMMAND} --only table5 --missing` goes on with it. Each table says its n; *earlier run* marks what an earlier run of "
-        "this command "
-        "measured, of the same processes and methods, and what has not been measured again (`earlier.toml`).\n"
+        f"`{COMMAND} --only table5 --missing` goes on with it. Each table says its n; *earlier run* marks what an earlier "
+        "run of this command measured, of the same processes and methods, and what has not been measured again "
+        "(`earlier.toml`).\n"
     )
 
 
