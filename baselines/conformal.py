@@ -81,7 +81,8 @@ def conformal(
         p = conformity.p_value(unlike)
         unknown = np.where(p <= level, s.unknown + 1, 0)
         found = said._replace(
-            alarm=said.alarm | (unknown >= lasts), label=np.where(unknown >= lasts, other, said.label),
+            alarm=said.alarm | (unknown >= lasts),
+            label=np.where(unknown >= lasts, other, np.maximum(said.label, 0)),  # -1 where it was lost: so is this
             label_probs=np.column_stack([p[:, None] * belief, 1.0 - p]),
             signals={**(said.signals or {}), "unlike": unlike},
         )  # fmt: skip

@@ -83,6 +83,12 @@ def fewer(G: Array, count: int) -> Array:
     return np.concatenate([whole, box[..., None] * np.eye(N)], axis=-1)
 
 
+def root(P: Array) -> Array:
+    """L (..., N, N) with P = L L', for a covariance that may be singular."""
+    values, vectors = np.linalg.eigh(P)
+    return vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+
+
 def set_filter(plant: Plant, model: AugmentedModel, faults: Deviations, bound: float, memory: int) -> Filter:
     """The filter of all labels' sets."""
     H, V = model.H, bound * np.sqrt(np.diag(model.R))
@@ -91,13 +97,13 @@ def set_filter(plant: Plant, model: AugmentedModel, faults: Deviations, bound: f
     equations, entries = linear_model(plant), fault_inputs(plant).entries
     N, m, labels, n_x = len(model.scale), len(model.R), len(faults.mid), len(plant.states)
     count, eye = GENERATORS * N, np.eye(N)
-    W = bound * np.linalg.cholesky(model.Q + 1e-300 * eye)
+    W = bound * root(model.Q)
     at = Interval(np.ones(1, np.int64), plant.trim_command[None], None, np.zeros((1, len(plant.known))))
     F = model.jacobian_f(np.zeros((1, N)), at)[1][0]
     wide, V_all = WIDE * np.diag(model.scale), np.diag(V)
 
     def start(n: int) -> Sets:
-        G = fewer(bound * np.linalg.cholesky(model.P0 + 1e-300 * eye), count)
+        G = fewer(bound * root(model.P0), count)
         return Sets(np.tile(model.X0, (n, labels, 1)), np.tile(G, (n, labels, 1, 1)), np.full((n, labels), memory),
                     np.zeros((n, labels)))  # fmt: skip
 
@@ -107,7 +113,7 @@ def set_filter(plant: Plant, model: AugmentedModel, faults: Deviations, bound: f
         own = [np.broadcast_to(W, (n, labels, N, N)), E @ faults.half]
         if at.Q_held is not None:  # what a command that did not report may be
             held = np.zeros((n, 1, N, N))
-            held[:, 0, :n_x, :n_x] = bound * np.linalg.cholesky(at.Q_held + 1e-300 * np.eye(n_x))
+            held[:, 0, :n_x, :n_x] = bound * root(at.Q_held)
             own.append(np.broadcast_to(held, (n, labels, N, N)))
         c = model.f(s.c, at) + (E @ faults.mid[..., None])[..., 0]
         return s._replace(c=c, G=fewer(np.concatenate([F @ s.G, *own], axis=-1), count))

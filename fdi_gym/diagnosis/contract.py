@@ -47,6 +47,7 @@ class Diagnoser(NamedTuple):
     gaps: bool = False
     filter: Any = None  # the `filtering.Filter` that it is made of, where it is
     rule: Any = None  # and the `estimation.decision.Rule`
+    guarded: bool = False  # whether it is under the guard already
 
 
 def widened(diagnoser: Diagnoser, plant: Plant, shown: Plant) -> Diagnoser:

@@ -75,9 +75,13 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
     diagnosis holds what cannot be (`examiner`), or whose update fails in linear algebra, is lost: label -1, which is never
     right, no alarm, estimate and state NaN, no probability for any label, from there to its end. The others are not touched.
 
+    A diagnoser that is under the guard stays as it is.
+
     Raises (from update):
         ValueError: obs has the wrong shape, or the diagnoser's answer does.
     """
+    if raw.guarded:
+        return raw
     width, examined = len(plant.observed), examiner(plant)
 
     def init(n: int) -> Any:
@@ -149,4 +153,4 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
             answer = answer._replace(alarm=answer.alarm & ~lost, label=np.where(lost, -1, answer.label), **numbers)
         return (after, answer, obs, lost), answer
 
-    return Diagnoser(init, update, raw.gaps, raw.filter, raw.rule)
+    return Diagnoser(init, update, raw.gaps, raw.filter, raw.rule, guarded=True)
