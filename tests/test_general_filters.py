@@ -526,7 +526,8 @@ def test_builders_fly_nothing_and_say_why_they_cannot(monkeypatch, plant_id, nam
         not reason
         or name in FAMILY
         or re.search(
-            "needs a linear plant|no trained weights|no label of|no unknown-input observer|are allowed|too much|three tanks only|overlap in time",
+            "needs a linear plant|no trained weights|no label of|no unknown-input observer|are allowed|too much|"
+            "three tanks only|overlap in time",
             reason,
         )
     ), reason
