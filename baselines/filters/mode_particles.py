@@ -30,7 +30,7 @@ from fdi_gym.estimation.interval import Interval
 from fdi_gym.plant import Array, NotApplicableError, Plant
 
 LEAST = 1e-12  # probability of a label
-MOST = 1.5e5  # evaluations of the plant's model per second of flight
+MOST = 1.9e5  # evaluations of the plant's model per second of flight
 OFFSETS = np.random.default_rng(20_030_423).random(4096)  # of the systematic samples, by sample number, the same for all
 
 
