@@ -3,7 +3,7 @@
 import numpy as np
 from numba import float64, int64, void
 
-from fdi_gym.estimation.gaussian_moments import UNSCENTED, factor, moments_of_points, spread, squared_step
+from fdi_gym.estimation.gaussian_points import UNSCENTED, factor, moments_of_points, spread, squared_step
 from fdi_gym.integration import interval
 from fdi_gym.kernels import M, V, compiled, helper, map_at, project_at
 

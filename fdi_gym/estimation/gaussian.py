@@ -27,7 +27,7 @@ import numpy as np
 
 from fdi_gym.estimation import gaussian_kernels as kernels
 from fdi_gym.estimation.gaussian_model import Model, bind
-from fdi_gym.estimation.gaussian_moments import CENTRAL_DIFFERENCE, EXTENDED, UNSCENTED
+from fdi_gym.estimation.gaussian_points import CENTRAL_DIFFERENCE, EXTENDED, UNSCENTED
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array
 

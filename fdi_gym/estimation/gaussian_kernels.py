@@ -5,14 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import boolean, float64, int64, void
 
-from fdi_gym.estimation.gaussian_moments import (
-    SIZES,
-    correct_episode,
-    linearised,
-    pass_points,
-    through,
-    through_matrix,
-)
+from fdi_gym.estimation.gaussian_moments import correct_episode, linearised, through, through_matrix
+from fdi_gym.estimation.gaussian_points import SIZES, pass_points
 from fdi_gym.kernels import M, V, compiled, helper
 
 I1, B2, M3 = int64[::1], boolean[:, ::1], float64[:, :, ::1]

@@ -1,0 +1,161 @@
+"""The points at which the compiled Gaussian step tries a model, and the moments of a Gaussian that passes through them.
+
+f and h are those of the augmented model; `gaussian_moments` says which points the rules take, and what they make of them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fdi_gym.integration import interval
+from fdi_gym.kernels import helper, map_at, project_at
+
+EXTENDED, UNSCENTED, CENTRAL_DIFFERENCE = 0, 1, 2
+JITTER, RETRIES = 1e-14, 7  # added to the diagonal where the factorisation fails, times 100 at each retry
+SIZES = 13  # integers before the lists of positions
+
+
+@helper
+def pass_points(moving, integers, reals, offset, direction, t, points, u, known, values):
+    """f (moving) or h of points (M, N) of an episode on the line (offset (p,), direction (p, n_m)).
+
+    That is the state one sample later, or what the chosen sensors read.
+    """
+    dynamics, output, project = map_at(integers[0]), map_at(integers[1]), project_at(integers[2])
+    substeps, n_x, n_y, n_theta = integers[3], integers[4], integers[5], integers[6]
+    p, n_d, m, own = integers[8], integers[9], integers[10], integers[11]
+    n_m = direction.shape[1]
+    entries, rest = integers[SIZES : SIZES + p], integers[SIZES + p :]
+    disturbances, sensors = rest[:n_d], rest[n_d:]
+    dt, nominal = reals[0], reals[1:]
+    now = nominal.copy()
+    theta, physical = now[:n_theta], now[n_theta:]
+    x, y, theta_now, still = np.empty(n_x), np.empty(n_y), np.empty(own), np.zeros(own)
+    theta_p = theta[:own]  # the rest are faults of the sensors
+    d = known.copy()
+    k1, k2, k3, k4, z = np.empty(n_x), np.empty(n_x), np.empty(n_x), np.empty(n_x), np.empty(n_x)
+    for i in range(points.shape[0]):
+        for e in range(p):
+            now[entries[e]] = nominal[entries[e]]
+        for e in range(p):
+            deviation = offset[e]
+            for j in range(n_m):
+                deviation += direction[e, j] * points[i, n_x + j]
+            now[entries[e]] += deviation
+        for j in range(n_d):
+            d[disturbances[j]] = points[i, n_x + n_m + j]
+        for j in range(n_x):
+            x[j] = points[i, j]
+        if moving:
+            interval(
+                dynamics, project, t, dt, substeps, x, u, False, theta_p, still, still, d, physical, theta_now,
+                k1, k2, k3, k4, z,
+            )  # fmt: skip
+            for j in range(n_x):
+                values[i, j] = x[j]
+        else:
+            output(t, x, u, theta_p, d, physical, y)
+            if own < n_theta:  # gains, then biases
+                for j in range(n_y):
+                    y[j] += y[j] * theta[own + j] + theta[own + n_y + j]
+            for j in range(m):
+                values[i, j] = y[sensors[j]]
+
+
+@helper
+def factor(P, U):
+    """P = U' U with the lower triangle of P; jitter only where it fails without, NaN where no jitter helps."""
+    n = P.shape[0]
+    jitter = 0.0
+    for attempt in range(RETRIES + 1):
+        for i in range(n):
+            for j in range(i, n):
+                U[i, j] = P[j, i]
+            U[i, i] += jitter
+        definite = True
+        for k in range(n):
+            if not U[k, k] > 0.0:  # also where it is no number
+                definite = False
+                break
+            U[k, k] = np.sqrt(U[k, k])
+            for j in range(k + 1, n):
+                U[k, j] /= U[k, k]
+            for i in range(k + 1, n):
+                factor = U[k, i]
+                for j in range(i, n):
+                    U[i, j] -= factor * U[k, j]
+        if definite:
+            return
+        jitter = JITTER * 100.0**attempt
+    for i in range(n):
+        for j in range(i, n):
+            U[i, j] = np.nan
+
+
+@helper
+def squared_step(rule, N):
+    """h^2 of the rules with points along the columns of a factor of P."""
+    return N + 2.0 if rule == UNSCENTED else 3.0
+
+
+@helper
+def spread(X, U, h, points):
+    """The points (2 N + 1, N): X, and X plus and minus h times each row of the upper triangle U."""
+    N = X.size
+    for i in range(N):
+        points[0, i] = X[i]
+    for j in range(N):
+        for i in range(N):
+            offset = h * U[j, i] if i >= j else 0.0
+            points[1 + j, i] = X[i] + offset
+            points[1 + N + j, i] = X[i] - offset
+
+
+@helper
+def moments_of_points(rule, U, low, values, first, mean, cross, cov):
+    """Mean (m,), cov (m, m) and cross (m, N) from `low` on of the values (2 N + 1, m) at points that a factor has spread.
+
+    Into values[1 : N + 1] go the second differences, into first (N, m) the halved first ones.
+    """
+    (N, m), h2 = first.shape, squared_step(rule, first.shape[0])
+    half, weight = 0.5 / np.sqrt(h2), 1.0 / (4.0 * h2) if rule == UNSCENTED else (h2 - 1.0) / (4.0 * h2 * h2)
+    for a in range(m):
+        mean[a] = 0.0
+        for i in range(N):
+            cross[a, i] = 0.0
+        for b in range(m):
+            cov[a, b] = 0.0
+    second = values[1 : N + 1]
+    for j in range(N):
+        for a in range(m):
+            first[j, a] = (values[1 + j, a] - values[1 + N + j, a]) * half
+            second[j, a] = values[1 + j, a] + values[1 + N + j, a] - 2.0 * values[0, a]
+            mean[a] += second[j, a]
+    for a in range(m):
+        mean[a] /= 2.0 * h2
+        for j in range(N):
+            for i in range(max(j, low), N):
+                cross[a, i] += first[j, a] * U[j, i]
+            weighed = weight * second[j, a]
+            for b in range(a + 1):
+                cov[a, b] += first[j, a] * first[j, b] + weighed * second[j, b]
+        if rule == UNSCENTED:
+            for b in range(a + 1):
+                cov[a, b] -= mean[a] * mean[b]
+    for a in range(m):
+        mean[a] += values[0, a]
+        for b in range(a):
+            cov[b, a] = cov[a, b]
+
+
+@helper
+def enters(moving, integers, direction, j):
+    """Whether f (moving) or h depends on entry j of X at all: a magnitude may move the sensors alone, or nothing."""
+    n_x, n_theta, p, own = integers[4], integers[6], integers[8], integers[11]
+    if j < n_x or j >= n_x + direction.shape[1]:
+        return True
+    for e in range(p):
+        sensors = own <= integers[SIZES + e] < n_theta
+        if direction[e, j - n_x] != 0.0 and not (moving and sensors):
+            return True
+    return False
