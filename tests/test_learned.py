@@ -10,6 +10,7 @@ import sys
 import zipfile
 
 import joblib
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -21,7 +22,7 @@ from baselines.learned import _attention, attention, features, flights, probabil
 from baselines.learned._network import SequenceNetwork, loss
 from baselines.learned._supervised import SupervisedTraining
 from baselines.learned.features import FeatureShape
-from baselines.learned.flights import CALIBRATION, TEST, TRAINING, VALIDATION, Condition
+from baselines.learned.flights import CALIBRATION, PER_SEED, TEST, TRAINING, VALIDATION, Condition
 from baselines.learned.recipes import SequenceRecipe
 from fdi_gym.diagnosis import (
     NotApplicableError,
@@ -510,3 +511,17 @@ def test_recipes_name_what_exists(plant_id, sensor_faults):
         assert condition.process in flights.plant_under(plant, condition).processes
     for name in recipes.residual_recipe(plant).filters:
         assert not find_diagnoser(name).clairvoyant
+
+
+def test_flights_of_several_windows_are_those_of_suites_and_no_seed_is_in_two_splits():
+    plant = build("CMGSatellite")
+    condition = Condition("standard", {}, windows=3, pace=0.2)
+    for first in (VALIDATION, CALIBRATION, TRAINING, TRAINING + PER_SEED):
+        found = [seed for i in range(5) for seed in condition.seeds(first + i)]
+        assert found == list(range(first, first + 15))
+    scenario = condition.scenario(plant, TRAINING + 7)
+    suite = msgspec.structs.replace(load_suite("cmg-standard"), seeds=list(range(TRAINING + 21, TRAINING + 24)), healthy=[])
+    assert scenario == suite.scenarios(plant, [0])[0]
+    assert scenario.steps < plant.draw("standard", TRAINING + 21).steps
+    whole = Condition("standard", {})
+    assert whole.scenario(plant, TRAINING + 7) == plant.draw("standard", TRAINING + 7)

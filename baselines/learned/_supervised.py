@@ -213,6 +213,6 @@ class SupervisedTraining(Training[SequenceRecipe]):
         samples = flights * self.validation[0].label.shape[1] * r.shape.period
         return {
             "task": "both", "filters": list(r.filters), "calibration": self.calibrated(),
-            "seeds": {"calibration": [CALIBRATION, CALIBRATION + r.validation - 1]},
+            "seeds": {"calibration": [CALIBRATION, self.last(CALIBRATION + r.validation - 1)]},
             "budget": {"flights": flights, "samples": samples, "passes": r.passes, "steps": self.done * self.per_pass},
         }  # fmt: skip

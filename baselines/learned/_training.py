@@ -132,6 +132,10 @@ class Training(ABC, Generic[R]):
         seeds = range(first, first + count)
         return [data.fly(p, c, seeds) for p, c in zip(self.plants, self.recipe.conditions, strict=True)]
 
+    def last(self, flight: int) -> int:
+        """The last seed of a flight of this number, under any condition."""
+        return max(condition.seeds(flight)[-1] for condition in self.recipe.conditions)
+
     # -- the loop
 
     def run(self, stop_after: int | None = None) -> Path:
@@ -169,7 +173,11 @@ class Training(ABC, Generic[R]):
         revision, versions = weights.made_with()
         last = self.first + r.identify + self.flights * r.candidates - 1
         own = self.card()
-        seeds = {"training": [self.first, last], "validation": [VALIDATION, VALIDATION + r.validation - 1]}
+        seeds = {
+            "training": [self.first, self.last(last)],
+            "validation": [VALIDATION, self.last(VALIDATION + r.validation - 1)],
+        }
+        cut = {"windows": [c.windows for c in r.conditions], "paces": [c.pace for c in r.conditions]}
         card = weights.Card(
             method=self.method, env=self.plant.env_id, plant=self.plant.id,
             options=[dict(plant.options) for plant in self.plants], processes=[c.process for c in r.conditions],
@@ -177,6 +185,7 @@ class Training(ABC, Generic[R]):
             shape=own.pop("shape", {**r.shape._asdict(), "hidden": r.hidden}), seeds=seeds | own.pop("seeds", {}),
             budget={**own.pop("budget"), "seconds": round(self.seconds, 1)},
             curve=self.curve, command=self.command, revision=revision, versions=versions, **own,
+            **(cut if max(cut["windows"]) > 1 else {}),  # type: ignore[arg-type]
         )  # fmt: skip
         path = self.work / f"{weights.stem(self.method, self.plant)}.safetensors"
         weights.write(path, self.tensors(), card)

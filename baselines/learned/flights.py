@@ -12,10 +12,11 @@ from baselines.learned.features import FeatureModel, FeatureShape
 from fdi_gym.diagnosis import Diagnosis, make_diagnoser, run
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import Record, simulate
-from fdi_gym.faults import draw
+from fdi_gym.faults import FaultScenario
 from fdi_gym.metrics import scored_samples
 from fdi_gym.plant import Array, Plant
 from fdi_gym.scores import balanced_accuracy
+from fdi_gym.suite import chained
 
 # the first seed of each split, which ends where the next begins
 TEST, VALIDATION, CALIBRATION, TRAINING = 1_000_000, 2_000_000, 2_500_000, 3_000_000
@@ -23,11 +24,24 @@ PER_SEED = 1_000_000  # training seeds that belong to one seed of a run
 
 
 class Condition(NamedTuple):
-    """A fault process to train on, the plant's options with it, and how far the plant's parameters may be off."""
+    """A fault process to train on, and how its flights are."""
 
     process: str
-    options: dict[str, float]
-    mismatch: float = 0.0
+    options: dict[str, float]  # of the plant
+    mismatch: float = 0.0  # how far its parameters may be off
+    windows: int = 1  # drawn flights whose faults follow one another in one, as in suites,
+    pace: float = 1.0  # with their times multiplied by this
+
+    def seeds(self, flight: int) -> range:
+        """The seeds of a flight of this number, which counts from the first seed of its split."""
+        split = max(first for first in (0, TEST, VALIDATION, CALIBRATION, TRAINING) if first <= flight)
+        first = split + (flight - split) // PER_SEED * PER_SEED
+        begin = first + (flight - first) * self.windows
+        return range(begin, begin + self.windows)
+
+    def scenario(self, plant: Plant, flight: int) -> FaultScenario:
+        """What a flight of this number is."""
+        return chained([plant.draw(self.process, seed, self.mismatch or None) for seed in self.seeds(flight)], self.pace)
 
 
 class Flights(NamedTuple):
@@ -52,7 +66,7 @@ def fly(plant: Plant, condition: Condition, seeds: Sequence[int]) -> Record:
     Raises:
         NotApplicableError: The plant has no mismatch, and the condition has.
     """
-    return simulate(plant, [plant.draw(condition.process, seed, condition.mismatch or None) for seed in seeds])
+    return simulate(plant, [condition.scenario(plant, seed) for seed in seeds])
 
 
 def identified(plants: Sequence[Plant], shape: FeatureShape, records: Sequence[Record]) -> FeatureModel:
@@ -74,7 +88,7 @@ def selected(plant: Plant, condition: Condition, candidates: Sequence[int], coun
     """
     if len(candidates) == count:
         return list(candidates)
-    shown = [np.unique(plant.label_rows(draw(plant.process(condition.process), seed))) for seed in candidates]
+    shown = [np.unique(plant.label_rows(condition.scenario(plant, seed))) for seed in candidates]
     often = np.bincount(np.concatenate(shown), minlength=len(plant.labels))
     rarest = np.array([labels[np.argmin(often[labels])] for labels in shown])
     turn = np.array([np.count_nonzero(rarest[:i] == label) for i, label in enumerate(rarest)])  # of its group
@@ -83,7 +97,7 @@ def selected(plant: Plant, condition: Condition, candidates: Sequence[int], coun
 
 def label_share(plant: Plant, condition: Condition, seeds: Sequence[int]) -> Array:
     """Share of each label in the flights of these seeds, as they are planned."""
-    rows = [plant.label_rows(draw(plant.process(condition.process), seed)) for seed in seeds]
+    rows = [plant.label_rows(condition.scenario(plant, seed)) for seed in seeds]
     return np.bincount(np.concatenate(rows), minlength=len(plant.labels)) / sum(map(len, rows))
 
 

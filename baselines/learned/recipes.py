@@ -127,6 +127,8 @@ FILTERS = {  # that residual_net is shown, and training flights per condition: f
     "MissilePitch": (("augmented_ekf_imm", "augmented_ekf_mode_probabilities"), 600),
     "CMGSatellite": (("mekf",), 400),
 }
+# fault windows in a flight that networks are shown, and their pace: whole flights are long, and its suites are so too
+WINDOWS = {"CMGSatellite": {"standard": (3, 0.2), "mixed": (3, 0.1)}}
 GENERAL_FILTERS = (("augmented_ekf", "multiple_model_ekf"), 300)
 POLICIES = {  # steps: decisions of a flight, less one
     "B747Lateral": {"steps": 299, "decisions": 600_000, "entropy": 0.003},
@@ -154,15 +156,28 @@ def sequence_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
     return found if budget is None else replace(found, flights=budget, chunk=min(found.chunk, budget))
 
 
+def network_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
+    """The recipe of the recurrent network: where whole flights are long, several windows of faults in a shorter one.
+
+    Args:
+        plant: The plant.
+        budget: Training flights per condition, in place of the recipe's.
+    """
+    found, cut = sequence_recipe(plant, budget), WINDOWS.get(plant.id, {})
+    windowed = [c if c.process not in cut else c._replace(windows=cut[c.process][0], pace=cut[c.process][1])
+                for c in found.conditions]  # fmt: skip
+    return replace(found, conditions=tuple(windowed))
+
+
 def randomised_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
     """The recipe of the network that is trained on plants off the model; arguments as in `sequence_recipe`."""
-    found = sequence_recipe(plant, budget)
+    found = network_recipe(plant, budget)
     return replace(found, conditions=tuple(c._replace(mismatch=MISMATCH) for c in found.conditions))
 
 
 def attention_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
     """The recipe of the network that attends to the last steps; arguments as in `sequence_recipe`."""
-    return replace(sequence_recipe(plant, budget), memory="attention", rate=1e-3)
+    return replace(network_recipe(plant, budget), memory="attention", rate=1e-3)
 
 
 def residual_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
@@ -171,7 +186,7 @@ def residual_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
     flights = most if budget is None else budget
     chunk = min(most, flights)
     return replace(
-        sequence_recipe(plant), filters=filters, identify=100, flights=flights, chunk=chunk, passes=20, validate=2, rate=1e-3
+        network_recipe(plant), filters=filters, identify=100, flights=flights, chunk=chunk, passes=20, validate=2, rate=1e-3
     )
 
 

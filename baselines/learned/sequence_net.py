@@ -23,13 +23,13 @@ from baselines.learned import attention, weights
 from baselines.learned import features as feat
 from baselines.learned.flights import filter_features
 from baselines.learned.probabilities import log_softmax
-from baselines.learned.recipes import attention_recipe, randomised_recipe, residual_recipe, sequence_recipe
+from baselines.learned.recipes import attention_recipe, network_recipe, randomised_recipe, residual_recipe
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser, diagnosers, make_diagnoser, trainer
 from fdi_gym.plant import Array, Plant
 
 ATTENTION = "attention_net"
 RECIPES = {
-    "sequence_net": sequence_recipe, "residual_net": residual_recipe, "randomised_net": randomised_recipe,
+    "sequence_net": network_recipe, "residual_net": residual_recipe, "randomised_net": randomised_recipe,
     ATTENTION: attention_recipe,
 }  # fmt: skip
 REACH = 10.0  # trust in filters is learned so many times faster than the rest: it must rise and fall by several logits

@@ -70,6 +70,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         shape: What the network is made of.
         filters: The diagnosers that it is shown.
         mismatch: How far the plants were off the model that it was trained on.
+        windows, paces: Of each process: fault windows in a flight, and the factor on their times; empty for whole flights.
         seeds: First and last seed of the training, validation and calibration flights.
         budget: What was used: flights, samples, steps, seconds.
         curve: The training curve: one entry per validation.
@@ -96,6 +97,8 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     shape: dict[str, Any]
     filters: list[str] = []
     mismatch: float = 0.0
+    windows: list[int] = []
+    paces: list[float] = []
     seeds: dict[str, list[int]]
     budget: dict[str, float]
     curve: list[dict[str, Any]]
