@@ -78,7 +78,8 @@ def identified(plants: Sequence[Plant], shape: FeatureShape, records: Sequence[R
     ]
     pairs = ((b[i : i + 50], d[i : i + 50]) for b, d in zip(z, truth, strict=True) for i in range(0, len(b), 50))
     model = feat.identify(plants[0], shape, pairs)
-    return feat.standardised(plants[0], shape, model, np.concatenate([b[:40] for b in z]))
+    shortest = min(b.shape[1] for b in z)
+    return feat.standardised(plants[0], shape, model, np.concatenate([b[:40, :shortest] for b in z]))
 
 
 def selected(plant: Plant, condition: Condition, candidates: Sequence[int], count: int) -> list[int]:
