@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from baselines.draws import uniform
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser
 from fdi_gym.plant import Array, Plant
 
@@ -31,13 +32,7 @@ def random(plant: Plant) -> Diagnoser:
     labels = len(plant.labels)
 
     def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
-        bits = np.ascontiguousarray(obs).view(np.uint64).sum(axis=1, dtype=np.uint64)[:, None]
-        with np.errstate(over="ignore"):  # splitmix64, one stream per answer
-            h = bits + np.uint64(0x9E3779B97F4A7C15) * np.arange(1, len(low) + 2, dtype=np.uint64)
-            h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-            h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-            h = h ^ (h >> np.uint64(31))
-        share = (h >> np.uint64(11)) / 2.0**53
+        share = uniform(obs, 1 + len(low))
         mode = np.minimum((share[:, 0] * labels).astype(np.int64), labels - 1)
         probs = np.full((len(obs), labels), 1.0 / labels)
         return state, Diagnosis(mode > 0, mode, low + (high - low) * share[:, 1:], None, probs)
@@ -60,10 +55,8 @@ def false_alarm(plant: Plant) -> Diagnoser:
     count = max(len(plant.labels) - 1, 1)
 
     def update(state: Array, obs: Array) -> tuple[Array, Diagnosis]:
-        bits = np.ascontiguousarray(np.nan_to_num(obs)).view(np.uint64).sum(axis=1, dtype=np.uint64)
-        with np.errstate(over="ignore"):
-            drawn = (bits * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(33)) % np.uint64(count)
-        label = np.where(state > 0, state, np.minimum(1 + drawn.astype(np.int64), len(plant.labels) - 1))
+        drawn = 1 + (uniform(np.nan_to_num(obs), 1)[:, 0] * count).astype(np.int64)
+        label = np.where(state > 0, state, np.minimum(drawn, len(plant.labels) - 1))
         return label, Diagnosis(np.ones(len(obs), bool), label, estimates[label])
 
     return Diagnoser(lambda n: np.zeros(n, np.int64), update, gaps=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from baselines.probing.draws import uniform
+from baselines.draws import uniform
 from baselines.probing.periodic import numbers_of
 from fdi_gym.agents import Prober
 from fdi_gym.diagnosis import prober

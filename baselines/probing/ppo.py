@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.special
 
+from baselines.draws import uniform
 from baselines.learned import weights
 from baselines.learned.policy import actor
-from baselines.probing.draws import uniform
 from baselines.probing.recipes import recipe_of
 from baselines.probing.sight import Past, Sight
 from fdi_gym.agents import Prober
