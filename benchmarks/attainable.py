@@ -29,7 +29,7 @@ FIRST = 5_000_000  # fresh seeds: neither test nor validation nor training fligh
 BANK = "onset_bank"
 SETTINGS = {  # of the first of these methods that can run
     BANK: [{"onsets": 2, "courses": 1}, {"onsets": 3}, {}, {"onsets": 8}, {"courses": 4}, {"sizes": 2}, {"every": 2}],
-    "mode_particles": [{"particles": 8}, {"particles": 16}, {"particles": 32}, {}, {"particles": 128}, {"every": 2}],
+    "mode_particles": [{"particles": 8}, {"particles": 16}, {"particles": 32}, {}, {"particles": 96}, {"every": 25}],
 }
 SUITES = ("b747-standard", "b747-hard", "tank-standard", "missile-standard", "huav-standard")
 INTRODUCTION = """# What can be attained
@@ -39,9 +39,8 @@ method is. What a method could reach that is told nothing but the process lies b
 the ceiling. `onset_bank` is meant to close that bracket from below: Bayes' rule over all that the process leaves open. It
 is exact where the model is linear, sizes are Gaussian and every onset is kept; the sections below show on fresh flights how
 little its score moves as that is refined. Where another method is better, it has not
-converged, or cannot run: faults that overlap, and sensors that fail in ways that are no line in theta. There
-`mode_particles` is refined in its place: as many histories of labels as it is given, but no more of the process than how
-often labels change and how large faults are.
+converged, or cannot run: faults that overlap, and sensors that fail in ways that are no line in theta. `mode_particles` can
+be refined there in its place.
 """
 
 
