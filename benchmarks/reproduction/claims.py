@@ -8,6 +8,7 @@ reach says so with a reason, and its figures are shown all the same.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -211,5 +212,8 @@ def section(make: Callable[[Found], str], found: Found) -> str:
     try:
         return make(found)
     except Missing as missing:
-        title = (make.__doc__ or make.__name__).strip().splitlines()[0].rstrip(".")
-        return f"*{title}: piece `{missing.args[0]}` is not measured.*\n"
+        waits = f"iece `{missing.args[0]}` is not measured.*\n"
+        while isinstance(make, functools.partial):
+            make = make.func
+        title = (make.__doc__ or "").strip().partition("\n")[0].rstrip(".")
+        return f"*{title}: p{waits}" if title else f"*P{waits}"
