@@ -233,6 +233,20 @@ def test_all_suites_are_evaluated_by_one_command(capsys, two):
     assert made["null"]["command"] == "fdi-gym evaluate other --diagnosers null"
 
 
+def test_the_rows_of_a_board_are_made_anew_by_one_command(capsys, two):
+    """Each suite's own methods: those that have a row in the folder."""
+    board = ("evaluate", "all", "--diagnosers", "board", "--jobs", "1", "--work", "again")
+    assert "say which, with --results" in refused(capsys, *board)
+    assert said(capsys, *ALL)[0] == 0
+    (two / "r" / "small" / "random.json").unlink()
+    before = rows_in(two / "r")
+    code, out, err = said(capsys, *board, "--results", "r", "--replace")
+    assert code == 0, err
+    assert [line.rpartition(",")[0] for line in out.strip().splitlines()[-2:]] == \
+        ["other: 2 rows in r/other", "small: 2 rows in r/small"]  # fmt: skip
+    assert rows_in(two / "r") == before
+
+
 def test_a_killed_run_over_all_suites_goes_on_where_it_was(capsys, two, monkeypatch):
     """Rows are written suite by suite, and no block is made twice."""
     evaluate = evaluation.evaluate

@@ -32,7 +32,7 @@ def fit(
         jobs: Worker processes, -1 for one per core.
         output: Folder that gets PLANT.json. Default: `fits` in the package of the methods, whence they are read.
         renew: The plant's file has changed and its flights should not have: find some of the fits anew, and where they are
-            the same bytes write the present digest of the code into the file.
+            the same, to rounding, write the present digest of the code into the file.
         count: So many beliefs, calibrations and conformities are found anew then.
         seed: Which ones. Default: drawn anew each time.
         backend: Where they run: "loky" is this machine; dask, ray and slurm are clusters that exist.
@@ -59,7 +59,7 @@ def fit(
         for path in {(package_of(entry) or Path()) / "fits" / f"{plant_id}.json" for entry in entries}:
             seed = secrets.randbits(32) if seed is None else seed
             knowledge.write_fits(path, knowledge.renewed(path, entries, asked, count, seed))
-            print(f"up to {count} fits of each kind (seed {seed}) are the same bytes; {path} is of this code now")
+            print(f"up to {count} fits of each kind (seed {seed}) are the same; {path} is of this code now")
         return
     with on(backend, cluster):
         fits = knowledge.fit_suites(entries, asked, jobs)

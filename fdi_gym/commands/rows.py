@@ -46,8 +46,8 @@ def evaluate(
     Args:
         suites: Names of suites, or paths of suite files; "all" for every one that is here.
         diagnosers: Names, where the suite is of probing of probers too; "reference" for those that others are compared with
-            first, "all" for every one, of which those run that can on the suite's plant; "module:function" for your own;
-            "truth" where diagnoses are allowed for.
+            first, "all" for every one, of which those run that can on the suite's plant; "board" for those that have a row
+            in the folder of results; "module:function" for your own; "truth" where diagnoses are allowed for.
         results: Folder for the rows, written as soon as a suite is finished; without it nothing but the tables is made.
         work: Folder of finished blocks. A killed run goes on from there.
         jobs: Worker processes, -1 for one per core.
@@ -71,7 +71,7 @@ def evaluate(
         raise ValueError("rows are made of the whole suite: --results and --episodes don't go together")
     if csv is not None:
         make_room(csv)
-    asked = _asked(suites, diagnosers, episodes)
+    asked = _asked(suites, diagnosers, episodes, results)
     if results is not None:
         for _, suite, plant, names in asked:
             row.check_writable(results, suite, names, partial(evaluation.digests_of, suite, plant), replace)
@@ -102,7 +102,10 @@ def evaluate(
         print("\n" + "\n".join(lines))
 
 
-def _asked(suites: Sequence[str], diagnosers: Sequence[str], episodes: int | None) -> list[_Asked]:
+BOARD = "board"  # in place of diagnosers: those that have a row
+
+
+def _asked(suites: Sequence[str], diagnosers: Sequence[str], episodes: int | None, results: Path | None) -> list[_Asked]:
     """What names of suites and of diagnosers stand for; what cannot run is said, before anything runs."""
     from fdi_gym import evaluation
     from fdi_gym.diagnosis import named
@@ -110,6 +113,8 @@ def _asked(suites: Sequence[str], diagnosers: Sequence[str], episodes: int | Non
     from fdi_gym.entrants import TRUTH
     from fdi_gym.suite import ActingSuite, load_suite, suite_names
 
+    if BOARD in diagnosers and results is None:
+        raise ValueError(f"{BOARD!r} are the diagnosers that have a row in a folder: say which, with --results")
     loaded = {name: load_suite(name) for name in (suite_names() if "all" in suites else suites)}
     if not loaded:
         raise ValueError(f"evaluate a suite, or all; there are {', '.join(suite_names())}")
@@ -117,7 +122,8 @@ def _asked(suites: Sequence[str], diagnosers: Sequence[str], episodes: int | Non
     for said, suite in loaded.items():
         suite = suite if episodes is None else suite.head(episodes)
         plant, acts = suite.build(), suite.acts if isinstance(suite, ActingSuite) else ""
-        names = named(diagnosers, acts == "probing")
+        there = _with_rows(results / suite.name) if results is not None and BOARD in diagnosers else []
+        names = named([*(name for name in diagnosers if name != BOARD), *there], acts == "probing")
         names += [TRUTH.name] if acts == "accommodation" and set(diagnosers) & set(GROUPS) else []
         able, reasons = evaluation.applicable(suite, plant, names)
         for name, reason in reasons.items():
@@ -129,6 +135,13 @@ def _asked(suites: Sequence[str], diagnosers: Sequence[str], episodes: int | Non
             f"none of these diagnosers can run on {' or '.join(sorted({suite.plant for suite in loaded.values()}))}"
         )
     return asked
+
+
+def _with_rows(folder: Path) -> list[str]:
+    """The diagnosers that have a row in a suite's folder; what a row alone names is not imported."""
+    from fdi_gym.leaderboard import read_rows
+
+    return [row.diagnoser for row in read_rows(folder) if ":" not in row.diagnoser]
 
 
 def verify(
