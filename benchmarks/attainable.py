@@ -29,7 +29,7 @@ FIRST = 5_000_000  # fresh seeds: neither test nor validation nor training fligh
 BANK = "onset_bank"
 SETTINGS = {  # of the first of these methods that can run
     BANK: [{"onsets": 2, "courses": 1}, {"onsets": 3}, {}, {"onsets": 8}, {"courses": 4}, {"sizes": 2}, {"every": 2}],
-    "mode_particles": [{"particles": 8}, {"particles": 16}, {"particles": 32}, {}, {"particles": 96}, {"every": 25}],
+    "mode_particles": [{"particles": 8}, {"particles": 16}, {"particles": 32}, {}, {"particles": 96}, {"every": 10}],
 }
 SUITES = ("b747-standard", "b747-hard", "tank-standard", "missile-standard", "huav-standard")
 INTRODUCTION = """# What can be attained

@@ -16,8 +16,8 @@ from numba import float64, int64, types, uint64, void
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from fdi_gym.integration import interval
-from fdi_gym.kernels import M, V, compiled, control_at, known_at, map_at, outside_at, project_at
+from fdi_gym.integration import interval_at
+from fdi_gym.kernels import M, V, compiled, control_at, known_at, map_at, outside_at
 from fdi_gym.noise import fill, uniform
 
 TILE = 32  # samples of one flight flown before the next one's turn
@@ -157,7 +157,7 @@ _I, _D3 = int64[::1], float64[:, :, ::1]
 
 @compiled(
     void(
-        int64, int64, int64, int64, int64, int64,
+        int64, int64, int64, int64, int64,
         float64, int64, int64, V, M, M, V, float64, _I,
         uint64[::1], _I, _I, _I, _I, _I, _I, _I, M, M, _D3, _I, int64[:, ::1], int64[:, :, ::1],
         _D3, _I, _I, M, M, M, M, M, _D3, _D3, M,
@@ -165,7 +165,7 @@ _I, _D3 = int64[::1], float64[:, :, ::1]
     )
 )  # fmt: skip
 def fly(
-    dynamics_address, output_address, control_address, known_address, project_address, outside_address,
+    interval_address, output_address, control_address, known_address, outside_address,
     dt, substeps, true_feedback, nominal, sensor_box, command_box, sigma, limit, widths,
     seed, steps, reference_at, disturbance_at, process_noise, sensor_noise, reference_step, disturbance_step,
     p, parameters, effects, counts, values, labels,
@@ -181,18 +181,18 @@ def fly(
     `sensors` (samples, flights, n_y, FAULTS) is what is wrong with the sensors; either may be empty. Of theta the plant's
     equations get the first `widths[2]` entries; where there are more, they are the faults of its sensors, column by column.
     """
-    dynamics, output, control = map_at(dynamics_address), map_at(output_address), control_at(control_address)
-    known, project, outside = known_at(known_address), project_at(project_address), outside_at(outside_address)
+    interval, output, control = interval_at(interval_address), map_at(output_address), control_at(control_address)
+    known, outside = known_at(known_address), outside_at(outside_address)
     n, n_u, n_c, n_y, n_theta = X.shape[1], U.shape[1], C.shape[1], sensor_box.shape[1], nominal.size
     n_k = obs.shape[2] - n_y - n_u
     n_r, n_d, own, healthy = widths[0], widths[1], widths[2], widths[3] != 0
     layered, tabled, reports = own < n_theta, sensors.shape[0] > 0, reporting.shape[0] > 0
     x, u, c, p_i, acts = np.empty(n), np.empty(n_u), np.empty(n_c), np.empty(p.shape[1]), np.empty(n_theta)
     y, shown, fed, out, wrong = np.empty(n_y), np.empty(n_y), np.empty(n_y), np.empty(n_k), np.zeros((n_y, FAULTS))
-    a, b, g, theta_k = np.empty(n_theta), np.empty(n_theta), np.empty(n_theta), np.empty(n_theta)
-    theta_p, a_p, b_p, g_p, acts_p = theta_k[:own], a[:own], b[:own], g[:own], acts[:own]  # the plant's own
+    course, theta_k = np.empty((3, n_theta)), np.empty(n_theta)
+    a, b, g, theta_p, acts_p = course[0], course[1], course[2], theta_k[:own], acts[:own]  # the last two: the plant's own
     r, d = np.empty(n_r), np.empty(n_d)
-    k1, k2, k3, k4, z, before = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    work, before = np.empty((5, n)), np.empty(n)
     used, words, normals = sigma > 0.0, np.empty((2, TILE), np.uint64), np.zeros((TILE, sigma.size))
     steady = not used.any()
     for tile in range(0, samples, TILE):
@@ -281,7 +281,7 @@ def fly(
                     drifts = _effects(k, False, dt, acting, count, values_i, held_i, nominal, a, b, g)
                 for i in range(n):
                     before[i] = x[i]
-                interval(dynamics, project, t, dt, substeps, x, u, drifts, a_p, b_p, g_p, d, p_i, acts_p, k1, k2, k3, k4, z)
+                interval(t, dt, substeps, drifts, x, u, course, d, p_i, acts_p, work)
                 for j in range(own, n_theta):
                     acts[j] = a[j] + (b[j] * (dt if g[j] < 0.0 else np.exp(-g[j] * dt)) if b[j] else 0.0)
                 lost = False

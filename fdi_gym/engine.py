@@ -11,7 +11,7 @@ feed back.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -76,6 +76,7 @@ def advance(
     references: Array | None = None,
     sensors: Array | None = None,
     threads: int | None = None,
+    meanwhile: Callable[[], bool] | None = None,
 ) -> Chunk:
     """Fly on by so many samples, or to a flight's end; without the GIL, blocks of flights in threads.
 
@@ -91,6 +92,7 @@ def advance(
             of its noise, 1 where it is frozen at its last reading, samples by which it lags, 1 where it does not report (it
             reads NaN, and the controller goes on with the last reading). Default: nothing, as is a table of zeros.
         threads: How many at most. Default: as many as numba may use (`NUMBA_NUM_THREADS`).
+        meanwhile: Called again and again while threads fly, until it says that there is nothing more to do.
 
     Raises:
         ValueError: Arrays of another shape, or a lag beyond what the flights remember.
@@ -108,7 +110,7 @@ def advance(
             f"a sensor lags by 0 to {max(flights.history.shape[1] - 1, 0)} samples (longest_lag of the flights)"
         )
     arguments = (
-        *plant.addresses, plant.dt, plant.substeps, int(plant.true_feedback), plant.nominal_theta,
+        *plant.addresses[:5], plant.dt, plant.substeps, int(plant.true_feedback), plant.nominal_theta,
         *flights.signals, *flights.arrays(),
     )  # fmt: skip
 
@@ -119,7 +121,11 @@ def advance(
     parts = max(1, min(most, len(slots), len(slots) * samples // WORTH_A_THREAD))
     if parts > 1:
         with ThreadPoolExecutor(parts) as pool:
-            list(pool.map(fly, np.array_split(slots, parts)))
+            under_way = [pool.submit(fly, block) for block in np.array_split(slots, parts)]
+            while meanwhile is not None and not all(part.done() for part in under_way) and meanwhile():
+                pass
+            for part in under_way:
+                part.result()
     else:
         fly(slots)
     return chunk

@@ -111,29 +111,31 @@ class FDIEnv(Specified, gym.Env):
         else:
             self._flights.begin([0], [scenario])
         self._k, self._over, self._declared, self._record = 0, False, [], None
-        self._base, self._flown, self._ahead = 0, 0, 0
+        self._base = self._first = self._flown = self._ahead = 0
         self._fly()
         if self.render_mode == "human":
             self.render()
         return self._block(0), self._info(0)
 
     def _fly(self) -> None:
-        """Fly on, and keep of the samples before what a block may still reach back to."""
+        """Fly on, and keep of the observations before what a block may still reach back to.
+
+        The rows of a chunk are cut once: each is an array of its own that nobody else reads.
+        """
         assert self._flights is not None
         chunk = self._advance(self._flights)
-        obs, theta, label = chunk.obs[:, 0], chunk.theta[:, 0], chunk.label[:, 0].tolist()
+        obs, theta = chunk.obs[:, 0], chunk.theta[:, 0]
         target = self.plant.estimate_target(theta, self.plant.split(obs)[1])
-        monitored = {name: a.tolist() for name, a in self.plant.monitor(chunk.state[:, 0]).items()}
-        keep = min(self._flown - self._base, self._flown - self._k + self._rules.period - 2)
-        if keep > 0:
-            obs, theta, target = (
-                np.concatenate([old[-keep:], new])
-                for old, new in ((self._obs, obs), (self._theta, theta), (self._target, target))
-            )
-            label = self._label[-keep:] + label
-            monitored = {name: self._monitored[name][-keep:] + values for name, values in monitored.items()}
-        self._obs, self._theta, self._target, self._label, self._monitored = obs, theta, target, label, monitored
-        self._base, self._flown = self._flown - max(keep, 0), self._flown + self._ahead
+        self._first, self._label, self._target = self._flown, chunk.label[:, 0].tolist(), list(np.array(target))
+        truth = {"label": self._label, "target": list(np.array(target)), "theta": list(np.array(theta))}
+        self._truth = truth | {name: a.tolist() for name, a in self.plant.monitor(chunk.state[:, 0]).items()}
+        if self._rules.period == 1:
+            self._obs = list(self._rules.show(obs))
+        else:
+            keep = min(self._flown - self._base, self._flown - self._k + self._rules.period - 2)
+            self._obs = np.concatenate([self._obs[-keep:], obs]) if keep > 0 else obs
+            self._base = self._flown - max(keep, 0)
+        self._flown += self._ahead
         self._length, self._terminated = int(self._flights.length[0]), bool(self._flights.terminated[0])
 
     def _advance(self, flights: Flights) -> Chunk:
@@ -151,7 +153,7 @@ class FDIEnv(Specified, gym.Env):
         if self._over:
             raise RuntimeError("the episode is over, or has not begun: call reset()")
         k, rules = self._k, self._rules
-        now = k - self._base
+        now = k - self._first
         checked = rules.task.check(action, ())
         reward = float(rules.task.reward(checked, self._label[now], self._target[now])) if k else 0.0
         if self.render_mode is not None:
@@ -169,20 +171,16 @@ class FDIEnv(Specified, gym.Env):
         return self._block(k), reward, terminated, self._over and not terminated, self._info(k)
 
     def _block(self, k: int) -> Array:
-        m, row = self._rules.period, k - self._base
+        m = self._rules.period
         if m == 1:
-            return self._rules.show(self._obs[row])
-        return self._rules.show(self._obs[row + np.maximum(np.arange(1 - m, 1), -k)])
+            return self._obs[k - self._first]
+        return self._rules.show(self._obs[k - self._base + np.maximum(np.arange(1 - m, 1), -k)])
 
     def _info(self, k: int) -> dict[str, Any]:
-        row = k - self._base
-        return {
-            "label": self._label[row],
-            "target": self._target[row].copy(),
-            "theta": self._theta[row].copy(),
-            "time": k * self.plant.dt,
-            **{name: values[row] for name, values in self._monitored.items()},
-        }
+        row = k - self._first
+        info = {name: values[row] for name, values in self._truth.items()}
+        info["time"] = k * self.plant.dt
+        return info
 
     def render(self) -> Array | None:
         """The episode so far: an (H, W, 3) uint8 picture for "rgb_array", a window for "human"."""

@@ -1,10 +1,12 @@
 """One sample interval of any plant, and the model's prediction and output for many points at once."""
 
+from typing import Any
+
 import numba
 import numpy as np
-from numba import float64, int64, void
+from numba import boolean, float64, int64, void
 
-from fdi_gym.kernels import M, V, compiled, map_at, project_at
+from fdi_gym.kernels import M, V, around, compiled, function_at, map_at
 
 
 @numba.njit
@@ -16,58 +18,65 @@ def _theta_at(tau, a, b, g, theta):
             theta[j] = a[j] + b[j] * (tau if g[j] < 0.0 else np.exp(-g[j] * tau))
 
 
-@numba.njit(inline="always")
-def interval(dynamics, project, t, dt, substeps, x, u, drifts, a, b, g, d, p, theta, k1, k2, k3, k4, z):
-    """One sample interval: x(t) -> x(t + dt) in place, theta(t + tau) = a + b exp(-g tau), or a + b tau where g < 0.
+def _around(dynamics: Any, project: Any) -> Any:
+    def interval(t, dt, substeps, drifts, x, u, course, d, p, theta, work):
+        a, b, g = course[0], course[1], course[2]
+        k1, k2, k3, k4, z = work[0], work[1], work[2], work[3], work[4]
+        n = x.size
+        _theta_at(0.0, a, b, g, theta)
+        if substeps == 0:
+            dynamics(t, x, u, theta, d, p, k1)
+            for i in range(n):
+                x[i] = k1[i]
+        else:
+            h = dt / substeps
+            for s in range(substeps):
+                tau = s * h
+                dynamics(t + tau, x, u, theta, d, p, k1)
+                for i in range(n):
+                    z[i] = x[i] + 0.5 * h * k1[i]
+                if drifts:
+                    _theta_at(tau + 0.5 * h, a, b, g, theta)
+                dynamics(t + tau + 0.5 * h, z, u, theta, d, p, k2)
+                for i in range(n):
+                    z[i] = x[i] + 0.5 * h * k2[i]
+                dynamics(t + tau + 0.5 * h, z, u, theta, d, p, k3)
+                for i in range(n):
+                    z[i] = x[i] + h * k3[i]
+                if drifts:
+                    _theta_at(tau + h, a, b, g, theta)
+                dynamics(t + tau + h, z, u, theta, d, p, k4)
+                for i in range(n):
+                    x[i] += h / 6.0 * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i])
+        if drifts:
+            _theta_at(dt, a, b, g, theta)
+        project(x, theta)
 
-    u and d are held. Classical Runge-Kutta with `substeps` steps; for `substeps` = 0 the plant is discrete and maps x
-    itself. `drifts` says whether any b is not 0.
+    return interval
+
+
+_INTERVAL = void(float64, float64, int64, boolean, V, V, M, V, V, V, M)
+interval_at = function_at(_INTERVAL)
+
+
+def interval(dynamics: Any, project: Any) -> Any:
+    """The kernel of one sample interval of a plant, compiled around its own; call it by address, with `interval_at`.
+
+    Its arguments: t, dt, substeps, drifts, x, u, course, d, p, theta, work (5, n_x), the last two for it to use. It moves x
+    on to t + dt with theta(t + tau) = a + b exp(-g tau), or a + b tau where g < 0, of the course (a, b, g); u and d are
+    held. Classical Runge-Kutta with `substeps` steps; for 0 the plant is discrete and maps x itself. `drifts` says whether
+    any b is not 0.
     """
-    n = x.size
-    _theta_at(0.0, a, b, g, theta)
-    if substeps == 0:
-        dynamics(t, x, u, theta, d, p, k1)
-        for i in range(n):
-            x[i] = k1[i]
-    else:
-        h = dt / substeps
-        for s in range(substeps):
-            tau = s * h
-            dynamics(t + tau, x, u, theta, d, p, k1)
-            for i in range(n):
-                z[i] = x[i] + 0.5 * h * k1[i]
-            if drifts:
-                _theta_at(tau + 0.5 * h, a, b, g, theta)
-            dynamics(t + tau + 0.5 * h, z, u, theta, d, p, k2)
-            for i in range(n):
-                z[i] = x[i] + 0.5 * h * k2[i]
-            dynamics(t + tau + 0.5 * h, z, u, theta, d, p, k3)
-            for i in range(n):
-                z[i] = x[i] + h * k3[i]
-            if drifts:
-                _theta_at(tau + h, a, b, g, theta)
-            dynamics(t + tau + h, z, u, theta, d, p, k4)
-            for i in range(n):
-                x[i] += h / 6.0 * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i])
-    if drifts:
-        _theta_at(dt, a, b, g, theta)
-    project(x, theta)
+    return around(_around, _INTERVAL, dynamics, project)
 
 
-@compiled(void(int64, int64, float64, int64, V, M, M, M, M, M, M))
-def propagate(dynamics_address, project_address, dt, substeps, t, x, u, theta, d, p, out):
+@compiled(void(int64, float64, int64, V, M, M, M, M, M, M))
+def propagate(interval_address, dt, substeps, t, x, u, theta, d, p, out):
     """out[i] = the state one sample after x[i]; t, u, theta, d, p have m rows that serve M/m consecutive points each."""
-    dynamics, project = map_at(dynamics_address), project_at(project_address)
+    interval = interval_at(interval_address)
     points, n = x.shape
-    xi, ui, ti, di, pi = (
-        np.empty(n),
-        np.empty(u.shape[1]),
-        np.empty(theta.shape[1]),
-        np.empty(d.shape[1]),
-        np.empty(p.shape[1]),
-    )
-    b, g, work = np.zeros(ti.size), np.zeros(ti.size), np.empty(ti.size)
-    k1, k2, k3, k4, z = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    xi, ui, di, pi = np.empty(n), np.empty(u.shape[1]), np.empty(d.shape[1]), np.empty(p.shape[1])
+    course, theta_now, work = np.zeros((3, theta.shape[1])), np.empty(theta.shape[1]), np.empty((5, n))
     every_t, every_u, every_theta = points // t.size, points // u.shape[0], points // theta.shape[0]
     every_d, every_p = points // d.shape[0], points // p.shape[0]
     for i in range(points):
@@ -75,13 +84,13 @@ def propagate(dynamics_address, project_address, dt, substeps, t, x, u, theta, d
             xi[j] = x[i, j]
         for j in range(ui.size):
             ui[j] = u[i // every_u, j]
-        for j in range(ti.size):
-            ti[j] = theta[i // every_theta, j]
+        for j in range(course.shape[1]):
+            course[0, j] = theta[i // every_theta, j]
         for j in range(di.size):
             di[j] = d[i // every_d, j]
         for j in range(pi.size):
             pi[j] = p[i // every_p, j]
-        interval(dynamics, project, t[i // every_t], dt, substeps, xi, ui, False, ti, b, g, di, pi, work, k1, k2, k3, k4, z)
+        interval(t[i // every_t], dt, substeps, False, xi, ui, course, di, pi, theta_now, work)
         for j in range(n):
             out[i, j] = xi[j]
 

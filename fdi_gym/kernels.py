@@ -13,23 +13,18 @@ role a function has, and the role fixes its compiled signature:
 with t the time [s], x the state, theta the fault parameter, d the disturbance, p the physical parameters, r the row
 of exogenous references, q the controller's parameters. A function with any other parameters is a helper that the
 file's kernels may call. A kernel must not call a kernel of another file, which is what keeps numba's disk cache valid:
-the generic kernels (`integration.py`, `closed_loop.py`) get the addresses of the plant's compiled functions (`address`)
-and call through them. So they are compiled once for all plants, and nothing is compiled to bring the two together.
+the generic kernels (`closed_loop.py`, the filters') get the addresses of the plant's compiled functions (`address`) and
+call through them. So they are compiled once for all plants. What is called most, a sample interval of `integration.py`,
+is compiled anew around each plant's equations (`around`).
 
-The cache lies in the user's cache folder (or `FDI_GYM_CACHE_DIR`) under a hash of the file that defines the kernel and
-of the files of the package that it imports, so that no edit is ever answered by old code. A damaged file there is an
-absent one, and where nothing can be written, everything is compiled in each process.
+`kernel_cache.py` says where the compiled code is kept.
 """
 
 from __future__ import annotations
 
 import functools
-import hashlib
 import importlib
 import inspect
-import os
-import pickle
-import re
 import sys
 import threading
 from collections.abc import Callable, Collection
@@ -37,10 +32,11 @@ from pathlib import Path
 from typing import Any
 
 import numba
-import platformdirs
 from numba import boolean, float64, int64, types, void
-from numba.core import caching, cgutils, config
+from numba.core import cgutils, config
 from numba.extending import intrinsic
+
+from fdi_gym.kernel_cache import Cache, cache_folder, name_around
 
 V, M = float64[::1], float64[:, ::1]
 
@@ -59,41 +55,6 @@ _ROLES = {
 }
 
 
-@functools.cache
-def sources(path: Path) -> tuple[Path, ...]:
-    """A source file and those of the package that it imports, directly or not: what its kernels can depend on."""
-    found, todo = set(), [path.resolve()]
-    while todo:
-        here = todo.pop()
-        if here not in found:
-            found.add(here)
-            todo += _imported(here)
-    return tuple(sorted(found))
-
-
-# An import of the package and what it names; in a docstring it only makes one file more to watch
-_IMPORT = re.compile(
-    r"(?:^|[:;])[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]*(\([^)]*\)|.*)|import[ \t]+(.*))", re.MULTILINE
-)
-
-
-@functools.cache
-def _imported(path: Path) -> tuple[Path, ...]:
-    """The files of the package that a source file imports. By its lines: its syntax tree would take 40 ms of each start."""
-    root, files = Path(__file__).resolve().parent, set()
-    for module, names, modules in _IMPORT.findall(path.read_text(encoding="utf-8")):
-        found = (
-            [module, *(f"{module}.{name}" for name in re.findall(r"\w+", names))]
-            if module
-            else re.findall(r"[\w.]+", modules)
-        )
-        for name in found:
-            package, *rest = name.split(".")
-            if package == root.name and (file := root.joinpath(*rest).with_suffix(".py")).is_file():
-                files.add(file)
-    return tuple(files)
-
-
 njit: Any = numba.njit  # what only kernels call needs no way in from Python or C, slow to compile: `helper`
 helper = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
@@ -102,85 +63,21 @@ _announced: set[str] = set()  # source files whose cold compilation has been ann
 _compiling = threading.RLock()
 
 
-@functools.cache
-def cache_folder(source: str) -> Path | None:
-    """The cache folder that belongs to these sources; None where there can be none."""
-    if not Path(source).is_file():
-        return None
-    digest = hashlib.sha256()
-    for path in sources(Path(source)):
-        digest.update(path.name.encode() + b"\0" + path.read_bytes())
-    base = Path(os.environ.get("FDI_GYM_CACHE_DIR") or platformdirs.user_cache_path("fdi_gym"))
-    folder = base / f"{Path(source).stem}-{digest.hexdigest()[:16]}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return None
-    return folder if os.access(folder, os.W_OK) else None
+def _lazily(function: Callable[..., Any], signature: Any, inside: tuple[Any, ...] = ()) -> Any:
+    """The function as numba's dispatcher, cached in the folder of its sources; nothing is compiled yet.
 
-
-class _CacheFile(caching.IndexDataCacheFile):
-    """Data files that begin with the digest of what they hold: machine code is not loaded from a damaged one."""
-
-    def _dump(self, obj: Any) -> bytes:
-        data = super()._dump(obj)
-        return hashlib.sha256(data).digest() + data
-
-    def _undamaged(self, path: str) -> bytes:
-        data = Path(path).read_bytes()
-        if hashlib.sha256(data[32:]).digest() != data[:32]:
-            raise ValueError(f"{path} is damaged")
-        return data[32:]
-
-    def _load_data(self, name: str) -> Any:
-        return pickle.loads(self._undamaged(self._data_path(name)))
-
-    def _save_index(self, overloads: Any) -> None:
-        with self._open_for_write(self._index_path) as file:
-            file.write(self._dump((self._version, self._source_stamp, overloads)))
-
-    def _load_index(self) -> Any:
-        if not Path(self._index_path).is_file():
-            return {}
-        version, stamp, overloads = pickle.loads(self._undamaged(self._index_path))
-        return overloads if (version, stamp) == (self._version, self._source_stamp) else {}
-
-
-class _Cache(caching.FunctionCache):
-    """numba's cache of a function, in which a damaged file is an absent one and a full or locked disk costs time only."""
-
-    def __init__(self, function: Any):
-        super().__init__(function)
-        file = self._cache_file
-        self._cache_file = _CacheFile(file._cache_path, file._index_name.removesuffix(".nbi"), file._source_stamp)
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        try:
-            return super().load_overload(sig, target_context)
-        except Exception:  # whatever unpickling finds in bytes that nobody wrote
-            return None
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        try:
-            try:
-                super().save_overload(sig, data)
-            except ValueError:  # the index is damaged: begin a new one
-                self._cache_file.flush()
-                super().save_overload(sig, data)
-        except OSError:
-            pass
-
-
-def _lazily(function: Callable[..., Any], signature: Any) -> Any:
-    """The function as numba's dispatcher, cached in the folder of its sources; nothing is compiled yet."""
-    folder = cache_folder(function.__code__.co_filename)
+    `inside`: kernels of a plant that are compiled into it. It then lies with the first of them.
+    """
+    folder = cache_folder((inside[0].py_func if inside else function).__code__.co_filename)
+    if not all(isinstance(k._cache, Cache) for k in inside):
+        folder = None
     dispatcher = njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True)(function)
     if folder is not None:
         settings: Any = config
         before = settings.CACHE_DIR
         settings.CACHE_DIR = str(folder)
         try:
-            dispatcher._cache = _Cache(function)  # type: ignore[attr-defined]
+            dispatcher._cache = Cache(function, inside)  # type: ignore[attr-defined]
         except (RuntimeError, OSError):  # numba finds no place for it
             pass
         finally:
@@ -195,7 +92,8 @@ def load(dispatcher: Any) -> Any:
         return dispatcher
     with _compiling:
         if not dispatcher.overloads:
-            source = dispatcher.py_func.__code__.co_filename
+            home = next(iter(getattr(dispatcher._cache, "_inside", ())), dispatcher)
+            source = home.py_func.__code__.co_filename
             folder = cache_folder(source)
             if source not in _announced and not (folder and any(folder.rglob("*.nbi"))):
                 print(f"fdi_gym: compiling {Path(source).stem} (once; kept in {folder})", file=sys.stderr, flush=True)
@@ -207,7 +105,8 @@ def load(dispatcher: Any) -> Any:
 
 def uncompiled(modules: Collection[str]) -> list[Any]:
     """The kernels of these modules, as far as they are imported, that the cache should have and does not have yet."""
-    found = [d for d in _signatures if d.py_func.__module__ in modules and not d.overloads and isinstance(d._cache, _Cache)]
+    own = [d for d in _signatures if d.py_func.__module__ in modules and d.py_func.__closure__ is None]
+    found = [d for d in own if not d.overloads and isinstance(d._cache, Cache)]
     return [d for d in found if not Path(d._cache._cache_file._index_path).is_file()]
 
 
@@ -228,6 +127,15 @@ def compiled(signature: Any) -> Callable[[Any], Any]:
         return dispatcher
 
     return decorate
+
+
+@functools.cache
+def around(make: Callable[..., Any], signature: Any, *kernels: Any) -> Any:
+    """The function that `make` writes around a plant's kernels, compiled with them inside it; cached with the first one."""
+    inner = njit(error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    function = make(*(inner(k.py_func) for k in kernels))
+    function.__qualname__ = f"{function.__name__}_{name_around(make, *kernels)}"
+    return _lazily(function, signature, kernels)
 
 
 class Sent:
@@ -257,12 +165,12 @@ def address(dispatcher: Any) -> int:
     return result.library.get_pointer_to_function(result.fndesc.llvm_func_name)
 
 
-def _function_at(signature: Any) -> Any:
+def function_at(signature: Any) -> Any:
     """An intrinsic that makes numba's first-class function of this signature from an address."""
     function_type = types.FunctionType(signature)
 
     @intrinsic
-    def function_at(typing_context, where):
+    def _at(typing_context, where):
         def codegen(context, builder, _, arguments):
             function = cgutils.create_struct_proxy(function_type)(context, builder)
             function.jit_addr = builder.inttoptr(arguments[0], cgutils.voidptr_t)
@@ -271,11 +179,11 @@ def _function_at(signature: Any) -> Any:
 
         return function_type(int64), codegen
 
-    return function_at
+    return _at
 
 
-map_at, control_at, known_at = _function_at(_MAP), _function_at(_CONTROL), _function_at(_KNOWN)
-project_at, outside_at = _function_at(_PROJECT), _function_at(_OUTSIDE)
+map_at, control_at, known_at = function_at(_MAP), function_at(_CONTROL), function_at(_KNOWN)
+outside_at = function_at(_OUTSIDE)
 
 
 # ---------------------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,17 @@ def contiguous(a: Any) -> Array:
         return a
     a = np.ascontiguousarray(a, float)
     return a if a.flags.writeable else a.copy()
+
+
+class Addresses(NamedTuple):
+    """Where the compiled equations of a plant lie; those that the closed loop calls come first."""
+
+    interval: int  # dynamics and project over a sample: `integration.interval`
+    output: int
+    control: int
+    known: int
+    outside: int
+    dynamics: int
 
 
 class Model:
@@ -74,19 +85,20 @@ class Model:
         return np.array([s.nominal for s in self.states])
 
     @functools.cached_property
-    def addresses(self) -> tuple[int, ...]:
-        """Addresses of the compiled kernels in the order of `Kernels`, with the defaults where the plant has none.
+    def addresses(self) -> Addresses:
+        """Addresses of the compiled kernels, with the defaults where the plant has none.
 
         Raises:
             NotApplicableError: The plant declares channels, and no equations.
         """
-        from fdi_gym import kernels
+        from fdi_gym import integration, kernels
 
         if self.kernels is None:
             raise NotApplicableError("needs equations; this plant declares channels only")
 
-        given = zip(self.kernels._fields, self.kernels, strict=True)
-        return tuple(kernels.address(function or getattr(kernels, role)) for role, function in given)
+        given = {role: f or getattr(kernels, role) for role, f in self.kernels._asdict().items()}
+        given["interval"] = integration.interval(given["dynamics"], given["project"])
+        return Addresses(*(kernels.address(given[role]) for role in Addresses._fields))
 
     def _rows(self, value: Array | None, default: Array) -> Array:
         rows = default if value is None else np.asarray(value, float)
@@ -130,7 +142,7 @@ class Model:
 
         x = np.asarray(x, float)
         rows = self._rows_of(t, x, u, theta, d, p, len(self.states))
-        integration.propagate(self.addresses[0], self.addresses[4], self.dt, self.substeps, *rows)
+        integration.propagate(self.addresses.interval, self.dt, self.substeps, *rows)
         return rows[-1].reshape(x.shape)
 
     def measure(
@@ -141,7 +153,7 @@ class Model:
 
         x = np.asarray(x, float)
         rows = self._rows_of(t, x, u, theta, d, p, len(self.outputs))
-        integration.evaluate(self.addresses[1], *rows)
+        integration.evaluate(self.addresses.output, *rows)
         y, own, n_y = rows[-1], self.own_theta, len(self.outputs)
         if theta is not None and own < len(self.theta):  # gains and biases of the sensors
             wrong = self._rows(theta, self.nominal_theta)[:, own : own + 2 * n_y]
@@ -155,7 +167,7 @@ class Model:
 
         x = np.asarray(x, float)
         rows = self._rows_of(t, x, u, theta, d, None, len(self.states))
-        integration.evaluate(self.addresses[0], *rows)
+        integration.evaluate(self.addresses.dynamics, *rows)
         return rows[-1].reshape(x.shape)
 
     @functools.cached_property

@@ -1,4 +1,4 @@
-"""The flights that come next, prepared a few at a time in the steps before they are wanted.
+"""The flights that come next, prepared before they are wanted: while threads fly, and a few at a time in the steps after.
 
 Flights of one length end together, and to begin a thousand in one step stalls it. An episode's seed comes from its
 environment's generator, so the flight that follows is known long before: it is drawn and prepared ahead, and taken where
@@ -44,14 +44,21 @@ class NextFlights:
         if self._owed < TOGETHER:
             return
         due, self._owed = int(self._owed), 0.0
-        for slot in reversed(self._queue[-due:]):
-            rng = generator(slot)
-            state = rng.bit_generator.state
-            seed = int(rng.integers(2**63))
-            rng.bit_generator.state = state
-            with contextlib.suppress(Exception):  # what is wrong is told when the flight begins, if it does
-                self._ready[slot] = seed, self._make(seed)
-        del self._queue[-due:]
+        while due and self.prepare_one(generator):
+            due -= 1
+
+    def prepare_one(self, generator: Callable[[int], np.random.Generator]) -> bool:
+        """The next of the queue; whether there was one."""
+        if not self._queue:
+            return False
+        slot = self._queue.pop()
+        rng = generator(slot)
+        state = rng.bit_generator.state
+        seed = int(rng.integers(2**63))
+        rng.bit_generator.state = state
+        with contextlib.suppress(Exception):  # what is wrong is told when the flight begins, if it does
+            self._ready[slot] = seed, self._make(seed)
+        return True
 
     def take(self, slot: int, seed: int) -> Prepared | None:
         """The prepared flight of this environment, if it has that seed."""

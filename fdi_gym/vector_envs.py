@@ -17,6 +17,7 @@ from fdi_gym.plant import Array, Plant
 from fdi_gym.rules import CHUNK, Rules, Specified, ahead, checked_mask, checked_seeds, whole
 
 NOTHING = Added()
+SOON = 8 * CHUNK  # samples before its end from which on a flight's next one may be prepared
 
 
 class FDIVectorEnv(Specified, VectorEnv):
@@ -169,7 +170,10 @@ class FDIVectorEnv(Specified, VectorEnv):
         """Fly these flights from this row on to where all end."""
         flights = self._flights
         assert flights is not None
-        advance(flights, self._filled - first, self._buffer, first, slots, added.inputs, added.references)
+        advance(
+            flights, self._filled - first, self._buffer, first, slots, added.inputs, added.references,
+            meanwhile=lambda: self._next.prepare_one(self._rng),
+        )  # fmt: skip
         rows = slice(first, self._filled)
         where: Any = rows if slots.size == self.num_envs else (rows, slots)
         obs, _, theta, _ = self._buffer
@@ -185,8 +189,9 @@ class FDIVectorEnv(Specified, VectorEnv):
         self._filled = m + self._ahead
         self._fly(m, self._all, self._added())
         if self._mode is not AutoresetMode.DISABLED:
-            under_way = np.flatnonzero(~self._over)
-            self._next.plan(under_way, (self._flights.length - self._k)[under_way] // m)  # type: ignore[union-attr]
+            left = self._flights.length - self._k  # type: ignore[union-attr]
+            soon = np.flatnonzero(~self._over & (left <= SOON))
+            self._next.plan(soon, left[soon] // m)
 
     def _added(self) -> Added:
         """What is added to the flights in the chunk that is flown next (see `advance`): nothing."""

@@ -90,7 +90,7 @@ def test_slew_reference_and_controller(plant):
     r = np.concatenate([q2, w2, [0.0]])
     close(cmg.attitude_error(*Q, r), [7.0662229079e-02, -1.9693934281e-01, 3.4893301364e-01, 9.1349192477e-01])
     close(cmg.sliding_mode(Y, r), [-1.2397555270e-02, 1.7691360842e-02, -3.7780266302e-02])
-    close(cmg.commanded_hdot(Y, r), [1.2768427586e-02, -1.7212035752e-02, 3.7481695836e-02])
+    close(cmg.commanded_hdot(Y, r, cmg.pyramid(*Y[6:10])[1]), [1.2768427586e-02, -1.7212035752e-02, 3.7481695836e-02])
     u = np.empty(4)
     cmg.control(2.0, Y, r, plant.q, np.zeros(0), u)
     close(u, [-2.1514467000e-01, 2.0528051308e00, 1.6419500072e00, -9.5664854869e-01])
@@ -199,7 +199,7 @@ def test_steering_delivers_what_is_asked_for():
         r = np.array([0.0, 0, 0, 1, 0, 0, 0, 0])
         cmg.control(0.0, y, r, plant.q, np.zeros(0), u)
         A, _ = cmg.cluster(y[6:10])
-        close(cmg.H0 * A @ u, cmg.commanded_hdot(y, r))
+        close(cmg.H0 * A @ u, cmg.commanded_hdot(y, r, cmg.pyramid(*y[6:10])[1]))
         assert abs(np.linalg.svd(A)[2][3] @ u) < 1e-12
 
 
@@ -223,7 +223,7 @@ def test_integration_order():
         from fdi_gym import integration
 
         out = np.empty((1, 11))
-        integration.propagate(plant.addresses[0], plant.addresses[4], h, substeps, np.zeros(1), x[None], r, F,
+        integration.propagate(plant.addresses.interval, h, substeps, np.zeros(1), x[None], r, F,
                           np.zeros((1, 0)), plant.nominal_p[None], out)  # fmt: skip
         return out[0]
 

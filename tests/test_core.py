@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import ROOT, build
 
-from fdi_gym import integration, kernels
+from fdi_gym import integration
 from fdi_gym.discovery import load_plant
 from fdi_gym.drawing import random_sign, stream, streams, uniform
 from fdi_gym.engine import no_noise, simulate, white_noise
@@ -35,11 +35,10 @@ def test_rk4_is_of_fourth_order(motor):
     """Halving the step divides the error by 16."""
     x = np.array([[3.0, 50.0]])
     flow, steps = {}, (16, 32, 64, 2048)
-    address, project = kernels.address(motor.kernels.dynamics), kernels.address(kernels.project)
     for n in steps:
         out = np.empty((1, 2))
-        integration.propagate(address, project, 8e-3, n, np.zeros(1), x, np.array([[12.0]]), np.array([[1.0, 0.5, 0.0]]),
-                          np.array([[0.02]]), motor.nominal_p[None], out)  # fmt: skip
+        where, u, theta, d = motor.addresses.interval, np.array([[12.0]]), np.array([[1.0, 0.5, 0.0]]), np.array([[0.02]])
+        integration.propagate(where, 8e-3, n, np.zeros(1), x, u, theta, d, motor.nominal_p[None], out)
         flow[n] = out
     error = [np.abs(flow[n] - flow[2048]).max() for n in steps[:3]]
     assert error[0] / error[1] == pytest.approx(16, rel=0.1)

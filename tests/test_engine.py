@@ -93,6 +93,14 @@ def test_threads_give_the_same_bytes(plant):
     equal(advance(one, 151, threads=1), advance(two, 151, threads=2), one)
 
 
+def test_who_waits_for_threads_may_do_something_else(plant):
+    flown, done = scenarios(plant, 64), []
+    one, two = Flights(plant, flown), Flights(plant, flown)
+    chunk = advance(two, 151, threads=2, meanwhile=lambda: done.append(1) is None and len(done) < 3)
+    assert len(done) <= 3
+    equal(advance(one, 151, threads=1), chunk, one)
+
+
 @pytest.mark.parametrize("travel", [copy.deepcopy, lambda f: pickle.loads(pickle.dumps(f))], ids=["copy", "pickle"])
 def test_a_copy_in_the_middle_goes_on_with_the_same_bytes(plant, travel):
     flights = Flights(plant, scenarios(plant, 4))

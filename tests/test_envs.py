@@ -45,6 +45,25 @@ def test_episode_is_the_recorded_flight(plant):
     assert len(rewards) == length
 
 
+@pytest.mark.parametrize("period", [1, 7])
+def test_what_an_agent_gets_is_its_own(plant, period):
+    """It may write to it: what follows, rewards too, is as if it had not."""
+    ours, theirs = (FDIEnv(plant.id, task="identification", decision_period=period) for _ in range(2))
+    low, high = ours.action_space.low, ours.action_space.high
+    action = np.where(np.isfinite(low) & np.isfinite(high), 0.5 * low + 0.5 * high, 0.0)
+    (obs, info), (other, written) = ours.reset(seed=4), theirs.reset(seed=4)
+    for _ in range(300 // period):
+        assert np.array_equal(obs, other)
+        assert {name: np.array(v).tolist() for name, v in info.items()} == \
+            {name: np.array(v).tolist() for name, v in written.items()}  # fmt: skip
+        other[:], written["target"][:], written["theta"][:] = 1e6, 1e6, 1e6
+        obs, reward, _, over, info = ours.step(action)
+        other, same, _, _, written = theirs.step(action)
+        assert reward == same
+        if over:
+            break
+
+
 def test_the_right_label_at_the_right_time_earns_all(b747):
     """The info shows the truth that the next action is compared with; the first action is worth nothing."""
     _, rewards, _, _ = play(FDIEnv("B747Lateral"), lambda info: info["label"], seed=2)

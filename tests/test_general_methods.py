@@ -65,6 +65,25 @@ def test_two_stage_equals_the_papers_on_the_linear_plant(b747):
 # -- interacting models
 
 
+@pytest.mark.parametrize("shared", [True, False], ids=["lines for all", "lines of each"])
+def test_a_mixture_on_lines_is_that_of_its_parts(shared):
+    rng = np.random.default_rng(4)
+    n, L, p, f = 3, 4, 5, 2
+    w, m, root = rng.dirichlet(np.ones(L), n), rng.standard_normal((n, L, f)), rng.standard_normal((n, L, f, f))
+    offset, direction = rng.standard_normal((n, L, p)), rng.standard_normal((n, L, p, f))
+    if shared:
+        offset[:], direction[:] = offset[0], direction[0]
+    lines = (offset[0], direction[0]) if shared else (offset, direction)
+    mean, P = mixing.over_lines(w, *lines, m, root @ np.swapaxes(root, 2, 3))
+    for i in range(n):
+        at = [offset[i, j] + direction[i, j] @ m[i, j] for j in range(L)]
+        first = sum(w[i, j] * at[j] for j in range(L))
+        own = [direction[i, j] @ root[i, j] for j in range(L)]
+        second = sum(w[i, j] * (own[j] @ own[j].T + np.outer(at[j], at[j])) for j in range(L))
+        np.testing.assert_allclose(mean[i], first, rtol=1e-12, atol=1e-13)
+        np.testing.assert_allclose(P[i], second - np.outer(first, first), rtol=1e-10, atol=1e-12)
+
+
 def test_mixing_keeps_the_mixture(plant):
     """Mean and second moment of state and disturbance, over all models, are those from before the mixing."""
     models = multiple_model.hypotheses(plant, belief_of(plant))

@@ -1,5 +1,6 @@
 """What methods know of a plant is shipped for the shipped suites: building flies nothing, fitting gives the same again."""
 
+import dataclasses
 import json
 
 import msgspec
@@ -10,7 +11,7 @@ from conftest import ROOT, build
 from fdi_gym.diagnosis import NotApplicableError, conforming, diagnosers, find_diagnoser, fitting, knowledge, make_diagnoser
 from fdi_gym.diagnosis.knowledge import Fits, fits_file, write_fits
 from fdi_gym.estimation.calibration import Calibration
-from fdi_gym.estimation.data import digest
+from fdi_gym.estimation.data import alike, digest
 from fdi_gym.suite import load_suite, suite_names
 
 SUITES = list(suite_names())
@@ -95,6 +96,15 @@ def test_an_edited_plant_or_a_damaged_file_is_not_answered_by_old_fits(monkeypat
     knowledge.fits_file.cache_clear()
 
 
+def test_what_is_known_of_a_plant_that_no_file_declares_is_found_each_time(b747):
+    """Its author may have changed it since."""
+    mine, found = dataclasses.replace(b747, id="Mine"), []
+    entry = find_diagnoser("augmented_ekf")
+    for _ in range(2):
+        knowledge._known(entry, mine, "calibrations", "key", lambda: found.append(1) or Calibration())
+    assert len(found) == 2
+
+
 def test_docstrings_and_comments_do_not_make_another_plant(tmp_path):
     text = '"""A plant."""\nX = 1.0  # unit\n\n\ndef f(x):\n    """It."""\n    return x + X\n'
     digests = []
@@ -150,6 +160,24 @@ def test_a_belief_is_near_what_the_data_sheet_declares():
 def test_flights_of_a_fit_are_validation_flights():
     assert fitting.VALIDATION_SEED == 2_000_000
     assert fitting.VALIDATION_SEED + fitting.FIRST + 100 < 3_000_000
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ({"R": [[1.0, 1e-21], [1e-21, 1.0]]}, {"R": [[1.0, 0.0], [3e-22, 1.0]]}, True),
+        ({"R": [1.0, 2.0]}, {"R": [1.0, 2.0 + 1e-7]}, False),
+        ({"R": [1.0, 2.0]}, {"R": [1.0, 2.0, 3.0]}, False),
+        ({"names": ["a"]}, {"names": ["b"]}, False),
+        ({"rise": 0.001}, {"rise": 0.0010001}, False),
+        ({"rise": 1}, {"fall": 1}, False),
+        ({"rise": True}, {"rise": 1}, False),
+        ({"rise": None}, {"rise": 0.0}, False),
+    ],
+)
+def test_what_is_the_same_to_rounding(one, other, same):
+    assert alike(one, other) is same
+    assert alike(one, one)
 
 
 @pytest.mark.parametrize("kind", ["belief", "calibration", "conformity"])

@@ -4,8 +4,8 @@ import numpy as np
 from numba import float64, int64, void
 
 from fdi_gym.estimation.gaussian_points import UNSCENTED, factor, moments_of_points, spread, squared_step
-from fdi_gym.integration import interval
-from fdi_gym.kernels import M, V, compiled, helper, map_at, project_at
+from fdi_gym.integration import interval_at
+from fdi_gym.kernels import M, V, compiled, helper
 
 M3 = float64[:, :, ::1]
 
@@ -18,17 +18,16 @@ def put_back(xi, sign, x):
         x[i if i < 3 else i + 1] = xi[i]
 
 
-@compiled(void(int64, int64, float64, int64, V, M, M3, V, M, M, M, M3, V))
-def predict(dynamics_address, project_address, dt, substeps, physical, X, P, sign, u, Q, X1, P1, sign1):
+@compiled(void(int64, float64, int64, V, M, M3, V, M, M, M, M3, V))
+def predict(interval_address, dt, substeps, physical, X, P, sign, u, Q, X1, P1, sign1):
     """X1, P1 and the signs one sample after X = (q1..q3, rest, theta) (n, N), P (n, N, N) and sign (n,) under u (n, n_u).
 
     Q (N, N) is what a sample adds; theta stays.
     """
-    dynamics, project = map_at(dynamics_address), project_at(project_address)
+    interval = interval_at(interval_address)
     (n, N), n_theta = X.shape, u.shape[1]
     n_x = N - n_theta + 1
-    x, theta, theta_now, still, d = np.empty(n_x), np.empty(n_theta), np.empty(n_theta), np.zeros(n_theta), np.zeros(0)
-    k1, k2, k3, k4, z = np.empty(n_x), np.empty(n_x), np.empty(n_x), np.empty(n_x), np.empty(n_x)
+    x, course, theta_now, d, work = np.empty(n_x), np.zeros((3, n_theta)), np.empty(n_theta), np.zeros(0), np.empty((5, n_x))
     U, points, values, first = np.empty((N, N)), np.empty((2 * N + 1, N)), np.empty((2 * N + 1, N)), np.empty((N, N))
     mean, cross, cov = np.empty(N), np.empty((N, N)), np.empty((N, N))
     for e in range(n):
@@ -37,9 +36,8 @@ def predict(dynamics_address, project_address, dt, substeps, physical, X, P, sig
         for i in range(2 * N + 1):
             put_back(points[i, : n_x - 1], sign[e], x)
             for j in range(n_theta):
-                theta[j] = values[i, n_x - 1 + j] = points[i, n_x - 1 + j]
-            interval(dynamics, project, 0.0, dt, substeps, x, u[e], False, theta, still, still, d, physical, theta_now,
-                     k1, k2, k3, k4, z)  # fmt: skip
+                course[0, j] = values[i, n_x - 1 + j] = points[i, n_x - 1 + j]
+            interval(0.0, dt, substeps, False, x, u[e], course, d, physical, theta_now, work)
             if i == 0:
                 sign1[e] = -1.0 if x[3] < 0.0 else 1.0
             for j in range(n_x - 1):

@@ -53,9 +53,8 @@ class JointUKF(NamedTuple):
 def predicted(plant: Plant, Q: Array, s: Attitude, u: Array) -> Attitude:
     """x (n, 14) one interval later, under the command u: the unscented transform, lambda = 2, with equal weights."""
     x, P, sign = np.empty(s.x.shape), np.empty(s.P.shape), np.empty(len(s.x))
-    dynamics, project = plant.addresses[0], plant.addresses[4]
     attitude_kernels.predict(
-        dynamics, project, plant.dt, plant.substeps, plant.nominal_p, contiguous(s.x), contiguous(s.P), s.sign,
+        plant.addresses.interval, plant.dt, plant.substeps, plant.nominal_p, contiguous(s.x), contiguous(s.P), s.sign,
         contiguous(u), Q, x, P, sign,
     )  # fmt: skip
     return Attitude(x, P, sign)

@@ -23,6 +23,7 @@ from scipy.special import logsumexp
 from baselines.filters.multiple_model import Hypotheses, hypotheses
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.diagnosis.contract import among
+from fdi_gym.estimation import mixing
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_labels
@@ -30,6 +31,7 @@ from fdi_gym.estimation.interval import Interval
 from fdi_gym.plant import Array, NotApplicableError, Plant
 
 LEAST = 1e-12  # probability of a label
+CHANCE = 0.06  # that the label changes from one sample at which it may to the next
 MOST = 1.9e5  # evaluations of the plant's model per second of flight
 OFFSETS = np.random.default_rng(20_030_423).random(4096)  # of the systematic samples, by sample number, the same for all
 
@@ -124,12 +126,7 @@ def particle_filter(b: Hypotheses, count: int, every: int) -> Filter:
         w = np.exp(s.log)
         mu = np.stack([(w * (s.label == j)).sum(axis=1) for j in range(labels)], axis=1)
         mu = np.maximum(mu, LEAST) / np.maximum(mu, LEAST).sum(axis=1, keepdims=True)
-        D = direction[s.label]  # (n, K, p, f)
-        deviation = offset[s.label] + (D @ s.X[..., z, None])[..., 0]
-        mean = (w[..., None] * deviation).sum(axis=1)
-        gap = deviation - mean[:, None]
-        wide = np.swapaxes(w[..., None, None] * (D @ s.P[..., z, z]), 1, 2).reshape(len(w), D.shape[2], -1)
-        P = wide @ np.swapaxes(D, 2, 3).reshape(len(w), -1, D.shape[2]) + np.swapaxes(w[..., None] * gap, 1, 2) @ gap
+        mean, P = mixing.over_lines(w, offset[s.label], direction[s.label], s.X[..., z], s.P[..., z, z])
         return Reading(mean, P, state(s), nu=s.nu, S=s.S, cost=-2.0 * np.log(mu), probs=mu)
 
     return Filter(
@@ -138,7 +135,9 @@ def particle_filter(b: Hypotheses, count: int, every: int) -> Filter:
 
 
 @diagnoser("mode_particles", "Rao-Blackwellised particle filter over the labels, for any plant", reference=True)
-def mode_particles(plant: Plant, belief: Belief, calibration: Calibration, particles: int = 64, every: int = 5) -> Diagnoser:
+def mode_particles(
+    plant: Plant, belief: Belief, calibration: Calibration, particles: int = 64, every: int | None = None
+) -> Diagnoser:
     """Particles with their decision.
 
     Args:
@@ -146,12 +145,15 @@ def mode_particles(plant: Plant, belief: Belief, calibration: Calibration, parti
         belief: The magnitudes of its faults, how often labels change, model errors.
         calibration: When it alarms.
         particles: How many go on.
-        every: Samples from one possible change of the label to the next.
+        every: Samples from one possible change of the label to the next. Default: so many that 6 % of them bring one. Where
+            they are many fewer, all places are soon taken by changes that no sample has yet told from none.
 
     Raises:
         NotApplicableError: The fault vector does not enter additively, or so many particles cost too much.
         ValueError: particles or every below 1.
     """
+    if every is None:
+        every = max(1, round(CHANCE / max(belief.changes, 1e-5)))
     if particles < 1 or every < 1:
         raise ValueError(f"particles and every are at least 1, not {particles} and {every}")
     b = hypotheses(plant, belief)

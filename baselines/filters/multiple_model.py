@@ -83,7 +83,6 @@ def bank(b: Hypotheses) -> Filter:
     N, m, z, x = len(model.scale), len(model.R), model.z, model.x
     assert model.lines is not None
     offset, direction = model.lines
-    lines = np.swapaxes(direction, 0, 1).reshape(offset.shape[1], -1)  # (p, labels f), those of all labels side by side
 
     def start(n: int) -> Models:
         X, P = np.tile(model.X0, (n, labels, 1)), np.tile(model.P0, (n, labels, 1, 1))
@@ -111,12 +110,8 @@ def bank(b: Hypotheses) -> Filter:
         return (mu[..., None] * s.X[..., x]).sum(axis=1)
 
     def read(s: Models) -> Reading:
-        deviation = offset + (direction @ s.X[..., z, None])[..., 0]  # (n, labels, p)
         mu = s.mu / s.mu.sum(axis=1, keepdims=True)
-        mean = (mu[..., None] * deviation).sum(axis=1)
-        D = deviation - mean[:, None]
-        within = np.swapaxes((mu[..., None, None] * (direction @ s.P[..., z, z])), 1, 2).reshape(len(mu), len(lines), -1)
-        P = within @ lines.T + np.swapaxes(mu[..., None] * D, 1, 2) @ D
+        mean, P = mixing.over_lines(mu, offset, direction, s.X[..., z], s.P[..., z, z])
         return Reading(mean, P, state(s), nu=s.nu, S=s.S, cost=-2.0 * np.log(s.mu), probs=mu)
 
     return Filter(

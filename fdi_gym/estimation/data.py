@@ -54,3 +54,33 @@ def from_json(text: bytes | str, kind: type[S]) -> S:
 def digest(value: Any) -> str:
     """SHA-256 of the object's JSON."""
     return hashlib.sha256(to_json(value)).hexdigest()
+
+
+def alike(one: Any, other: Any) -> bool:
+    """Whether two objects are the same to rounding: their texts are, and their numbers to eight digits.
+
+    A number in a list or table counts as much as nine digits of the largest one there: what rounding leaves of a zero
+    differs from one processor, or order of the same sums, to another.
+    """
+    return _alike(msgspec.json.decode(to_json(one)), msgspec.json.decode(to_json(other)))
+
+
+def _alike(a: Any, b: Any) -> bool:
+    if type(a) is not type(b):
+        return False
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(_alike(a[key], b[key]) for key in a)
+    if isinstance(a, list) and not _numbers(a):
+        return len(a) == len(b) and all(map(_alike, a, b))
+    if isinstance(a, (list, int, float)) and _numbers(b):
+        x, y = np.array(a, float), np.array(b, float)
+        return x.shape == y.shape and np.allclose(x, y, 1e-8, 1e-9 * abs(y).max(initial=0.0), equal_nan=True)
+    return a == b
+
+
+def _numbers(a: Any) -> bool:
+    """A number, or a list or table of them."""
+    try:
+        return np.array(a, float).size >= 0
+    except (TypeError, ValueError):
+        return False

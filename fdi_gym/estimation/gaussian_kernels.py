@@ -6,7 +6,7 @@ import numpy as np
 from numba import boolean, float64, int64, void
 
 from fdi_gym.estimation.gaussian_moments import correct_episode, linearised, through, through_matrix
-from fdi_gym.estimation.gaussian_points import SIZES, pass_points
+from fdi_gym.estimation.gaussian_points import COMMANDS, KNOWN, SENSORS, STATES, pass_points
 from fdi_gym.kernels import M, V, compiled, helper
 
 I1, B2, M3 = int64[::1], boolean[:, ::1], float64[:, :, ::1]
@@ -21,7 +21,7 @@ def _check(integers, step, X, t, u, known):
         raise ValueError("X needs one entry for each of the model's [x; m; d]")
     if t.size == 0 or n % t.size or u.shape[0] == 0 or n % u.shape[0] or known.shape[0] == 0 or n % known.shape[0]:
         raise ValueError("t, u and d need one row for each episode, or fewer that serve equally many episodes each")
-    if u.shape[1] != integers[SIZES - 1] or known.shape[1] != integers[7]:
+    if u.shape[1] != integers[COMMANDS] or known.shape[1] != integers[KNOWN]:
         raise ValueError("u needs one entry for each command of the plant, d one for each disturbance, measured or not")
 
 
@@ -42,7 +42,7 @@ def _check_sensors(n, m, y, seen):
 @compiled(void(int64, *MODEL, V, M, M, M3, V, M, M, M3, M, M3))
 def predict(rule, integers, reals, step, offset, direction, limit, plant, X, P, t, u, known, Q, X1, P1):
     """X1 and P1 one sample after X (n, N) and P (n, N, N)."""
-    (n, N), n_x = X.shape, integers[4]
+    (n, N), n_x = X.shape, integers[STATES]
     if n == 0:
         return
     _check(integers, step, X, t, u, known)
@@ -84,7 +84,7 @@ def update(
     rule, integers, reals, step, offset, direction, H, seen, count, X, P, t, u, known, y, R, X1, P1, nu, S, distance, log
 ):
     """X1 and P1 after the sensors y (n, m) at t, of which `seen` reported."""
-    (n, N), m = X.shape, integers[10]
+    (n, N), m = X.shape, integers[SENSORS]
     if n == 0:
         return
     _check(integers, step, X, t, u, known)
@@ -156,5 +156,5 @@ def images(moving, integers, reals, step, offset, direction, X, t, u, known, out
         pass_points(moving, integers, reals, offset[line], direction[line], te, X[e], ue, de, out[e])
         if moving:
             for i in range(points):
-                for j in range(integers[4], N):
+                for j in range(integers[STATES], N):
                     out[e, i, j] = X[e, i, j]

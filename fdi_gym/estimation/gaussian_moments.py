@@ -20,8 +20,10 @@ from __future__ import annotations
 import numpy as np
 
 from fdi_gym.estimation.gaussian_points import (
+    DISTURBANCES,
     EXTENDED,
     SIZES,
+    STATES,
     enters,
     factor,
     moments_of_points,
@@ -44,7 +46,7 @@ def through(rule, moving, integers, reals, step, offset, direction, t, X, P, u, 
         factor(P, U)
         spread(X, U, np.sqrt(squared_step(rule, N)), points)
         pass_points(moving, integers, reals, offset, direction, t, points, u, known, values)
-        low = integers[4] if moving else 0  # of f, nobody asks for the covariance with x before
+        low = integers[STATES] if moving else 0  # of f, nobody asks for the covariance with x before
         moments_of_points(rule, U, low, values, first, mean, cross, cov)
         return
     moved = 0  # columns that are not 0
@@ -109,7 +111,7 @@ def linearised(integers, offset, direction, plant, X, u, known, F, mean):
 
     plant (n_x, ...) has the columns [g, A, B, G, E[0], E[1], ...].
     """
-    n_x, n_u, n_D, p, n_d, n_m = F.shape[0], u.size, known.size, offset.size, integers[9], direction.shape[1]
+    n_x, n_u, n_D, p, n_d, n_m = F.shape[0], u.size, known.size, offset.size, integers[DISTURBANCES], direction.shape[1]
     B = 1 + n_x
     G = B + n_u
     E = G + n_D

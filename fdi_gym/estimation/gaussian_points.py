@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from fdi_gym.integration import interval
-from fdi_gym.kernels import helper, map_at, project_at
+from fdi_gym.integration import interval_at
+from fdi_gym.kernels import helper, map_at
 
 EXTENDED, UNSCENTED, CENTRAL_DIFFERENCE = 0, 1, 2
 JITTER, RETRIES = 1e-14, 7  # added to the diagonal where the factorisation fails, times 100 at each retry
-SIZES = 13  # integers before the lists of positions
+# The integers of a model: two addresses, then sizes, then the lists of positions (entries, disturbances, sensors)
+INTERVAL, OUTPUT, SUBSTEPS, STATES, OUTPUTS, THETA, KNOWN, ENTRIES, DISTURBANCES, SENSORS, OWN, COMMANDS, SIZES = range(13)
 
 
 @helper
@@ -21,19 +22,19 @@ def pass_points(moving, integers, reals, offset, direction, t, points, u, known,
 
     That is the state one sample later, or what the chosen sensors read.
     """
-    dynamics, output, project = map_at(integers[0]), map_at(integers[1]), project_at(integers[2])
-    substeps, n_x, n_y, n_theta = integers[3], integers[4], integers[5], integers[6]
-    p, n_d, m, own = integers[8], integers[9], integers[10], integers[11]
+    interval, output = interval_at(integers[INTERVAL]), map_at(integers[OUTPUT])
+    substeps, n_x, n_y, n_theta = integers[SUBSTEPS], integers[STATES], integers[OUTPUTS], integers[THETA]
+    p, n_d, m, own = integers[ENTRIES], integers[DISTURBANCES], integers[SENSORS], integers[OWN]
     n_m = direction.shape[1]
     entries, rest = integers[SIZES : SIZES + p], integers[SIZES + p :]
     disturbances, sensors = rest[:n_d], rest[n_d:]
     dt, nominal = reals[0], reals[1:]
     now = nominal.copy()
     theta, physical = now[:n_theta], now[n_theta:]
-    x, y, theta_now, still = np.empty(n_x), np.empty(n_y), np.empty(own), np.zeros(own)
+    x, y, theta_now, course = np.empty(n_x), np.empty(n_y), np.empty(own), np.zeros((3, own))
     theta_p = theta[:own]  # the rest are faults of the sensors
     d = known.copy()
-    k1, k2, k3, k4, z = np.empty(n_x), np.empty(n_x), np.empty(n_x), np.empty(n_x), np.empty(n_x)
+    work = np.empty((5, n_x))
     for i in range(points.shape[0]):
         for e in range(p):
             now[entries[e]] = nominal[entries[e]]
@@ -47,10 +48,9 @@ def pass_points(moving, integers, reals, offset, direction, t, points, u, known,
         for j in range(n_x):
             x[j] = points[i, j]
         if moving:
-            interval(
-                dynamics, project, t, dt, substeps, x, u, False, theta_p, still, still, d, physical, theta_now,
-                k1, k2, k3, k4, z,
-            )  # fmt: skip
+            for j in range(own):
+                course[0, j] = theta[j]
+            interval(t, dt, substeps, False, x, u, course, d, physical, theta_now, work)
             for j in range(n_x):
                 values[i, j] = x[j]
         else:
@@ -151,7 +151,7 @@ def moments_of_points(rule, U, low, values, first, mean, cross, cov):
 @helper
 def enters(moving, integers, direction, j):
     """Whether f (moving) or h depends on entry j of X at all: a magnitude may move the sensors alone, or nothing."""
-    n_x, n_theta, p, own = integers[4], integers[6], integers[8], integers[11]
+    n_x, n_theta, p, own = integers[STATES], integers[THETA], integers[ENTRIES], integers[OWN]
     if j < n_x or j >= n_x + direction.shape[1]:
         return True
     for e in range(p):

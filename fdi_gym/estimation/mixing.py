@@ -29,6 +29,24 @@ def mixture(w: Array, X: Array, P: Array) -> tuple[Array, Array]:
     return mean, mixed + np.swapaxes(w[..., None] * spread, 2, 3) @ spread
 
 
+def over_lines(w: Array, offset: Array, direction: Array, m: Array, M: Array) -> tuple[Array, Array]:
+    """Mean (n, p) and covariance (n, p, p) of a mixture on lines: of offset + direction z, where z has mean m, covariance M.
+
+    Args:
+        w: Weights (n, L), which sum to 1.
+        offset: (L, p) or (n, L, p).
+        direction: (L, p, f) or (n, L, p, f).
+        m: (n, L, f).
+        M: (n, L, f, f).
+    """
+    at = offset + (direction @ m[..., None])[..., 0]
+    mean = (w[..., None] * at).sum(axis=1)
+    gap, p = at - mean[:, None], at.shape[2]
+    within = np.swapaxes(w[..., None, None] * (direction @ M), 1, 2).reshape(len(w), p, -1)
+    lines = np.swapaxes(direction, -1, -2).reshape(*direction.shape[:-3], -1, p)  # those of all L one below the other
+    return mean, within @ lines + np.swapaxes(w[..., None] * gap, 1, 2) @ gap
+
+
 def mix(w: Array, X: Array, P: Array, own: slice, m0: Array, M0: Array) -> tuple[Array, Array]:
     """The mixtures, where the entries `own` of X belong to each model alone.
 

@@ -59,11 +59,13 @@ from typing import Annotated, Any, Literal, NamedTuple
 import msgspec
 import numpy as np
 from msgspec import UNSET, Meta, UnsetType
+from numba import void
 
 from fdi_gym.acting import Acting, Probe, square
 from fdi_gym.checks import number
 from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Scoring
-from fdi_gym.kernels import kernel
+from fdi_gym.kernels import M, V, compiled, kernel
+from fdi_gym.model import contiguous
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
 from fdi_gym.shapes import Nothing, Shapes
 
@@ -243,10 +245,9 @@ def sliding_mode(y, r):
 
 
 @kernel
-def commanded_hdot(y, r):
+def commanded_hdot(y, r, E):
     """u = -tau_c - w x h(d): the rate of change of the cluster's momentum that the control torque asks for [N m]."""
     tau1, tau2, tau3 = sliding_mode(y, r)
-    _, E = _pyramid(y[6], y[7], y[8], y[9])
     h1, h2, h3 = (
         H0 * dot4(E[0], 1.0, 1.0, 1.0, 1.0),
         H0 * dot4(E[1], 1.0, 1.0, 1.0, 1.0),
@@ -255,12 +256,10 @@ def commanded_hdot(y, r):
     return -tau1 - (y[4] * h3 - y[5] * h2), -tau2 - (y[5] * h1 - y[3] * h3), -tau3 - (y[3] * h2 - y[4] * h1)
 
 
+@kernel
 def determinant(a, b, c, i, j, k):
     """Determinant of the columns i, j, k of the matrix with rows a, b, c."""
     return a[i] * (b[j] * c[k] - b[k] * c[j]) - a[j] * (b[i] * c[k] - b[k] * c[i]) + a[k] * (b[i] * c[j] - b[j] * c[i])
-
-
-_determinant = kernel(determinant)
 
 
 @kernel
@@ -269,8 +268,8 @@ def control(t, y, r, q, c, u):
 
     q = 1 for robust or 0 for pinv, amplitude of the null motion, effectiveness that is allowed for (4).
     """
-    hdot1, hdot2, hdot3 = commanded_hdot(y, r)
-    A, _ = _pyramid(y[6], y[7], y[8], y[9])
+    A, E = _pyramid(y[6], y[7], y[8], y[9])
+    hdot1, hdot2, hdot3 = commanded_hdot(y, r, E)
     A = (
         (q[2] * A[0][0], q[3] * A[0][1], q[4] * A[0][2], q[5] * A[0][3]),
         (q[2] * A[1][0], q[3] * A[1][1], q[4] * A[1][2], q[5] * A[1][3]),
@@ -289,10 +288,10 @@ def control(t, y, r, q, c, u):
         u[i] = (A[0][i] * z1 + A[1][i] * z2 + A[2][i] * z3) / H0
     if q[1] > 0.0:
         excitation = q[1] * np.sin(2.0 * np.pi * t / NULL_PERIOD)
-        u[0] += excitation * _determinant(A[0], A[1], A[2], 1, 2, 3)
-        u[1] -= excitation * _determinant(A[0], A[1], A[2], 0, 2, 3)
-        u[2] += excitation * _determinant(A[0], A[1], A[2], 0, 1, 3)
-        u[3] -= excitation * _determinant(A[0], A[1], A[2], 0, 1, 2)
+        u[0] += excitation * determinant(A[0], A[1], A[2], 1, 2, 3)
+        u[1] -= excitation * determinant(A[0], A[1], A[2], 0, 2, 3)
+        u[2] += excitation * determinant(A[0], A[1], A[2], 0, 1, 3)
+        u[3] -= excitation * determinant(A[0], A[1], A[2], 0, 1, 2)
     peak = max(max(abs(u[0]), abs(u[1])), max(abs(u[2]), abs(u[3])))
     if peak > R_MAX:
         for i in range(4):
@@ -323,11 +322,20 @@ def inertia(A: np.ndarray) -> np.ndarray:
     return np.diag(JS) - JW * (A @ np.swapaxes(A, -1, -2))
 
 
+@compiled(void(M, V))
+def _singularities(d, det):
+    for i in range(det.size):
+        (a, b, c), _ = _pyramid(d[i, 0], d[i, 1], d[i, 2], d[i, 3])
+        det[i] = determinant(a, b, c, 0, 1, 2) ** 2 + determinant(a, b, c, 0, 1, 3) ** 2
+        det[i] += determinant(a, b, c, 0, 2, 3) ** 2 + determinant(a, b, c, 1, 2, 3) ** 2
+
+
 def singularity(d: np.ndarray) -> np.ndarray:
-    """det(A A') (...): 1.1857 at rest, 0 where the cluster is singular. By the squared minors of A (Cauchy, Binet)."""
-    A, _ = pyramid(*np.moveaxis(np.asarray(d, float), -1, 0))
-    minors = [determinant(*A, *columns) for columns in itertools.combinations(range(4), 3)]
-    return np.square(minors).sum(axis=0)
+    """det(A A') (...) at d (..., 4): 1.1857 at rest, 0 where the cluster is singular. By A's minors (Cauchy, Binet)."""
+    angles = np.asarray(d, float)
+    det = np.empty(angles.shape[:-1])
+    _singularities(contiguous(angles.reshape(-1, 4)), det.reshape(-1))
+    return det
 
 
 # ---------------------------------------------------------------------------------------------------------------

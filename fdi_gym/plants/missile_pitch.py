@@ -127,9 +127,11 @@ def dynamics(t, x, u, theta, d, p, dx):
     C_m0 = moment(alpha, mach, A_M * (1.0 + p[3]), B_M * (1.0 + p[4]), C_M * (1.0 + p[5]))
     C_m = C_m0 + (1.0 - theta[2]) * D_M * (1.0 + p[7]) * delta
     Z_1 = K1 * K_Q * mach * mach * abs(B_M) * alpha * abs(alpha)
-    Z_2 = L2 * np.exp(-((alpha / ALPHA_J) ** 2))
     dx[0] = K_ALPHA * mach * np.cos(alpha) * normal(mach, alpha, delta, theta, p) + q
-    dx[1] = K_Q * mach * mach * C_m + (1.0 - theta[4]) * L_J * jet + theta[0] * Z_1 + theta[1] * Z_2
+    dx[1] = K_Q * mach * mach * C_m + (1.0 - theta[4]) * L_J * jet + theta[0] * Z_1
+    if theta[1] != 0.0:  # a quarter of the time of a flight would go into an exponential that counts for nothing
+        Z_2 = L2 * np.exp(-((alpha / ALPHA_J) ** 2))
+        dx[1] += theta[1] * Z_2
     dx[2], dx[3] = delta_dot, OMEGA_F * OMEGA_F * (u[0] - delta) - 2.0 * ZETA_F * OMEGA_F * delta_dot
     if theta[3] >= 0.5:
         dx[2], dx[3] = 0.0, 0.0
