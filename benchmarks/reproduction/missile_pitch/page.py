@@ -112,7 +112,7 @@ entry for eta in `Plant`.
 
 def study(found: Found, claims: Statements) -> str:
     """The study's scenario."""
-    s, m = found["study"], found["mirror"]
+    s, m = (found["study"][name] for name in ("study", "mirror"))
     values = [s["T_d"], s["T_s"], s["matched"], s["matched_at_alarm"], s["rms_error"], s["rms"], *s["theta"],
               s["wrong_theta"], s["theorem"], m["T_d"], m["T_s"], m["rms_error"], m["rms"], m["theorem"]]  # fmt: skip
     rows = [[r["quantity"], f"about {r['study']:g}" if "study" in r else "not stated", f"{r['reference']:g}", f"{value:.3f}"]
