@@ -38,6 +38,7 @@ def check_bounds_at(plant: Plant, t: float, x: Array, u: Array, theta: Array) ->
         "c": len(plant.c0), "out": len(plant.known), "dx": len(plant.states),
     }  # fmt: skip
     values = {name: np.zeros(width) for name, width in widths.items()}
+    values |= {f"J_{name}": np.zeros((widths["dx"], widths[name])) for name in ("x", "theta", "d", "p")}
     values |= {
         "x": x,
         "u": u,
@@ -48,7 +49,7 @@ def check_bounds_at(plant: Plant, t: float, x: Array, u: Array, theta: Array) ->
     }
     made: dict[Any, Callable[..., Any]] = {}
     # the sensors first: the controller reads what they say
-    for role in ("output", "known", "control", "dynamics", "project", "outside"):
+    for role in ("output", "known", "control", "dynamics", "project", "outside", "jacobian"):
         kernel = getattr(plant.kernels, role)
         if kernel is None:
             continue
@@ -59,7 +60,7 @@ def check_bounds_at(plant: Plant, t: float, x: Array, u: Array, theta: Array) ->
             with np.errstate(all="ignore"), contextlib.suppress(ArithmeticError, ValueError, TypeError, AttributeError):
                 _in_python(kernel, made)(*(np.float64(t) if name == "t" else arrays[name] for name in names))
         except IndexError as error:
-            have = ", ".join(f"{name} {widths[name]}" for name in names if name != "t")
+            have = ", ".join(f"{name} {' by '.join(map(str, values[name].shape))}" for name in names if name != "t")
             raise ValueError(
                 f"{plant.id}: the kernel {role!r} reaches beyond its arrays: {error}; it gets so many numbers in {have}"
             ) from error

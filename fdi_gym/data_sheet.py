@@ -90,6 +90,7 @@ class Kernels(NamedTuple):
     known: Any = None
     project: Any = None
     outside: Any = None
+    jacobian: Any = None  # without it filters take differences of the interval, several times as slow
 
 
 def squared_error(scale: Sequence[float]) -> Callable[[Array], Array]:

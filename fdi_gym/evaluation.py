@@ -183,7 +183,10 @@ def _run_block(suite: AnySuite, name: str, episodes: range, path: Path, identity
 
 
 class _Plan:
-    """Which blocks there are to run, in which order: block after block, in each the quickest method first."""
+    """Which blocks there are to run, in which order: block after block, in each the quickest method first.
+
+    In the last one it is the slowest, so that at the end no core waits for it.
+    """
 
     def __init__(self, suite: AnySuite, plant: Plant, names: Sequence[str], work: Path, size: int):
         self.suite, self.plant, self.names = suite, plant, names
@@ -230,7 +233,9 @@ class _Plan:
         where an error would be lost: it is kept for the caller."""
         try:
             for i, episodes in enumerate(self.ranges):
-                for name in sorted(self.names, key=lambda n: self.seconds.get(n, float("inf") if i else 0.0)):
+                last = 0 < i == len(self.ranges) - 1
+                order = sorted(self.names, key=lambda n: self.seconds.get(n, float("inf") if i else 0.0), reverse=last)
+                for name in order:
                     if name not in self.digests:
                         bar.set_postfix_str(f"{name}: preparing")
                     self.prepare(name)

@@ -9,6 +9,8 @@ role a function has, and the role fixes its compiled signature:
     known(t, r, c, out)                  what else the flight computer knows at t, before it computes the command
     project(x, theta)                    puts the state back on its manifold after a step (unit quaternion, jammed fin)
     outside(t, x, r)                     True where the flight ends: validity of the model or loss of control
+    jacobian(t, x, u, theta, d, p, J_x, J_theta, J_d, J_p)
+                                         partial derivatives of dx by x, theta, d and p, rows as in dx; they come zeroed
 
 with t the time [s], x the state, theta the fault parameter, d the disturbance, p the physical parameters, r the row
 of exogenous references, q the controller's parameters. A function with any other parameters is a helper that the
@@ -45,6 +47,7 @@ _CONTROL = void(float64, V, V, V, V, V)
 _KNOWN = void(float64, V, V, V)
 _PROJECT = void(V, V)
 _OUTSIDE = boolean(float64, V, V)
+_JACOBIAN = void(float64, V, V, V, V, V, M, M, M, M)
 _ROLES = {
     ("t", "x", "u", "theta", "d", "p", "dx"): _MAP,
     ("t", "x", "u", "theta", "d", "p", "y"): _MAP,
@@ -52,6 +55,7 @@ _ROLES = {
     ("t", "r", "c", "out"): _KNOWN,
     ("x", "theta"): _PROJECT,
     ("t", "x", "r"): _OUTSIDE,
+    ("t", "x", "u", "theta", "d", "p", "J_x", "J_theta", "J_d", "J_p"): _JACOBIAN,
 }
 
 

@@ -96,9 +96,20 @@ class Model:
         if self.kernels is None:
             raise NotApplicableError("needs equations; this plant declares channels only")
 
-        given = {role: f or getattr(kernels, role) for role, f in self.kernels._asdict().items()}
+        given = {role: f or getattr(kernels, role, None) for role, f in self.kernels._asdict().items()}
         given["interval"] = integration.interval(given["dynamics"], given["project"])
         return Addresses(*(kernels.address(given[role]) for role in Addresses._fields))
+
+    @functools.cached_property
+    def tangent(self) -> int:
+        """Address of `tangent.tangent` around its kernels; 0 where it says no derivatives."""
+        from fdi_gym import kernels
+        from fdi_gym.tangent import tangent
+
+        own = self.kernels
+        if own is None or own.jacobian is None:
+            return 0
+        return kernels.address(tangent(own.dynamics, own.jacobian, own.project))
 
     def _rows(self, value: Array | None, default: Array) -> Array:
         rows = default if value is None else np.asarray(value, float)

@@ -91,7 +91,7 @@ def test_rows_do_not_depend_on_blocks_and_workers(small, found, tmp_path):
         assert one.row == found[name].row
 
 
-def test_within_a_block_the_quickest_method_comes_first(small, tmp_path, monkeypatch):
+def test_within_a_block_the_quickest_method_comes_first_and_in_the_last_the_slowest(small, tmp_path, monkeypatch):
     order = []
     real = evaluation.diagnose
 
@@ -101,7 +101,7 @@ def test_within_a_block_the_quickest_method_comes_first(small, tmp_path, monkeyp
 
     monkeypatch.setattr(evaluation, "diagnose", watched)
     evaluate(load_suite(str(small)), ["random", "null"], work=tmp_path, block=4, **QUIET)
-    assert order == [(0, "random"), (0, "null"), (4, "null"), (4, "random"), (8, "null"), (8, "random")]
+    assert order == [(0, "random"), (0, "null"), (4, "null"), (4, "random"), (8, "random"), (8, "null")]
 
 
 # -- suites

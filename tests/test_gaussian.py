@@ -28,6 +28,7 @@ def output(t, x, u, theta, d, p, y):
 
 CLOCK = dataclasses.replace(build("DCMotor"), kernels=build("DCMotor").kernels._replace(dynamics=dynamics, output=output))
 ALL_PLANTS = [*PLANTS, "DCMotor", "clock"]
+DIFFERENTIATED = [plant_id for plant_id in PLANTS if build(plant_id).kernels.jacobian is not None]
 EPISODES = 6
 TOLERANCE = 1e-10  # in units of standard deviations
 
@@ -35,11 +36,15 @@ TOLERANCE = 1e-10  # in units of standard deviations
 class Case:
     """A plant with its whole theta estimated, and a random Gaussian for each of n episodes.
 
-    Without `lines` half of its disturbances are in X; with them none is, and all are known.
+    Without `lines` half of its disturbances are in X; with them none is, and all are known. Its Jacobians are those of
+    differences, but where the plant's own derivatives are asked for.
     """
 
-    def __init__(self, plant_id, lines=None, n=EPISODES, seed=0):
-        plant = self.plant = CLOCK if plant_id == "clock" else build(plant_id)
+    def __init__(self, plant_id, lines=None, n=EPISODES, seed=0, derivatives=False):
+        plant = CLOCK if plant_id == "clock" else build(plant_id)
+        if not derivatives:
+            plant = dataclasses.replace(plant, kernels=plant.kernels._replace(jacobian=None))
+        self.plant = plant
         rng = self.rng = np.random.default_rng(seed)
         p, n_D = len(plant.theta), len(plant.disturbances)
         self.entries = rng.permutation(p)
@@ -178,6 +183,37 @@ def test_jacobians_are_central_differences(plant_id, which):
     unit = np.abs(expected * case.scale).max(axis=2, keepdims=True)
     unit = np.where(unit > 0, unit, 1.0) / case.scale  # a sign does not move
     assert J / unit == pytest.approx(expected / unit, abs=1e-10)
+
+
+@pytest.mark.parametrize("plant_id", DIFFERENTIATED)
+@pytest.mark.parametrize("lines", [None, 3])
+@pytest.mark.parametrize("physical", [False, True])
+def test_with_the_plants_derivatives_the_jacobian_is_exact(plant_id, lines, physical):
+    """Against a five-point difference; the prediction is F P F' + Q with it, and the mean the plant's to the bit."""
+    case = Case(plant_id, lines, derivatives=True)
+    if physical:  # entries beyond theta
+        case.entries = len(case.plant.theta) + case.rng.permutation(len(case.plant.nominal_p))[: len(case.entries)]
+        used = slice(0, len(case.entries))
+        case.offset, case.direction = 0.1 * case.offset[:, used], 0.1 * case.direction[:, used]
+        case.model = case.bind()
+    X, F = gaussian.jacobian_f(case.model, case.X, case.t, case.u, case.d)
+    step = 1e-5 * case.scale
+
+    def f(points):
+        return gaussian.f(case.model, points, case.t, case.u, case.d)
+
+    assert np.array_equal(X, f(case.X[:, None])[:, 0])
+    values = [f(case.X[:, None] + j * np.diag(step)) for j in (-2, -1, 1, 2)]
+    five = np.swapaxes(values[0] - 8 * values[1] + 8 * values[2] - values[3], 1, 2) / (12 * step)
+    unit = np.abs(five * case.scale).max(axis=2, keepdims=True) / case.scale
+    unit = np.where(unit > 0, unit, 1.0)
+    assert F / unit == pytest.approx(five / unit, abs=2e-8)
+    mean, P = case.predict("extended")
+    assert np.array_equal(mean, X)
+    expected = F @ case.P @ np.swapaxes(F, 1, 2) + case.Q[np.arange(EPISODES) % len(case.Q)]
+    std = np.sqrt(np.einsum("nii->ni", expected))
+    unit = std[:, :, None] * std[:, None]
+    assert P / unit == pytest.approx(expected / unit, abs=TOLERANCE)
 
 
 def test_only_one_plant_is_linear_and_is_taken_so():

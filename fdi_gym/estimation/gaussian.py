@@ -7,7 +7,8 @@ x by one sample (theta, d and the command held) and leaves m and d; an entry bey
 parameters; h gives the chosen sensors. A Gaussian passes through
 f and h by one of three rules:
 
-    "extended"            A. H. Jazwinski, Stochastic Processes and Filtering Theory, 1970; Jacobians by differences
+    "extended"            A. H. Jazwinski, Stochastic Processes and Filtering Theory, 1970; f's Jacobian is exact where the
+                          plant says its derivatives (`fdi_gym.tangent`), others by central differences
     "unscented"           S. J. Julier, J. K. Uhlmann, Proceedings of the IEEE 92(3), 2004; lambda = 2, equal weights
     "central difference"  M. Norgaard, N. K. Poulsen, O. Ravn, Automatica 36(11), 2000; interval sqrt(3)
 
@@ -27,7 +28,7 @@ import numpy as np
 
 from fdi_gym.estimation import gaussian_kernels as kernels
 from fdi_gym.estimation.gaussian_model import Model, bind
-from fdi_gym.estimation.gaussian_points import CENTRAL_DIFFERENCE, EXTENDED, UNSCENTED
+from fdi_gym.estimation.gaussian_points import CENTRAL_DIFFERENCE, EXTENDED, TANGENT, UNSCENTED
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array
 
@@ -101,7 +102,14 @@ def h(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> Arr
 
 
 def jacobian_f(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> tuple[Array, Array]:
-    """X (n, N) one sample after t (n,) [s], and the Jacobian of that (n, N, N) by central differences."""
+    """X (n, N) one sample after t (n,) [s], and the Jacobian of that (n, N, N).
+
+    It is exact where the plant says its derivatives; elsewhere central differences take its place.
+    """
+    if model.constants[0][TANGENT] and X.shape[1:] == model.step.shape:
+        X1, F = np.empty(X.shape), np.empty((*X.shape, X.shape[1]))
+        _call(kernels.differentiate, model.constants, X, t, u, model.unmeasured if d is None else d, X1, F)
+        return X1, F
     return _differences(model, f(model, _along_axes(model, X), t, u, d))
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import boolean, float64, int64, void
 
-from fdi_gym.estimation.gaussian_moments import correct_episode, linearised, through, through_matrix
-from fdi_gym.estimation.gaussian_points import COMMANDS, KNOWN, SENSORS, STATES, pass_points
+from fdi_gym.estimation.gaussian_moments import correct_episode, differentiated, linearised, through, through_matrix
+from fdi_gym.estimation.gaussian_points import COMMANDS, EXTENDED, KNOWN, SENSORS, STATES, TANGENT, pass_points
 from fdi_gym.kernels import M, V, compiled, helper
 
 I1, B2, M3 = int64[::1], boolean[:, ::1], float64[:, :, ::1]
@@ -54,6 +54,10 @@ def predict(rule, integers, reals, step, offset, direction, limit, plant, X, P, 
         if plant.shape[0] > 0:
             linearised(integers, offset[line], direction[line], plant, X[e], ue, de, F, mean)
             through_matrix(F, P[e], cross, cov)
+        elif rule == EXTENDED and integers[TANGENT] != 0:
+            te = t[e * t.size // n]
+            differentiated(integers, reals, step, offset[line], direction[line], te, X[e], ue, de, F, mean)
+            through_matrix(F, P[e], cross, cov)
         else:
             te = t[e * t.size // n]
             through(
@@ -77,6 +81,24 @@ def predict(rule, integers, reals, step, offset, direction, limit, plant, X, P, 
                 for j in range(N):
                     P1[e, i, j] *= shrink
                     P1[e, j, i] *= shrink
+
+
+@compiled(void(*MODEL, M, V, M, M, M, M3))
+def differentiate(integers, reals, step, offset, direction, X, t, u, known, X1, F):
+    """X1 (n, N) one sample after X and F (n, N, N) its Jacobian, of a plant that says its derivatives."""
+    (n, N), n_x = X.shape, integers[STATES]
+    if n == 0:
+        return
+    _check(integers, step, X, t, u, known)
+    mean, moved = np.empty(n_x), np.empty((n_x, N))
+    for e in range(n):
+        line, te = e % offset.shape[0], t[e * t.size // n]
+        ue, de = u[e * u.shape[0] // n], known[e * known.shape[0] // n]
+        differentiated(integers, reals, step, offset[line], direction[line], te, X[e], ue, de, moved, mean)
+        for i in range(N):
+            X1[e, i] = mean[i] if i < n_x else X[e, i]
+            for j in range(N):
+                F[e, i, j] = moved[i, j] if i < n_x else (1.0 if i == j else 0.0)
 
 
 @compiled(void(int64, *MODEL, M, B2, I1, M, M3, V, M, M, M, M3, M, M3, M, M3, V, V))

@@ -28,7 +28,7 @@ class Model(NamedTuple):
     def __reduce__(self) -> tuple[Any, ...]:
         """Copied and pickled without the addresses of compiled code, which hold in this process only."""
         integers, *rest = self.constants
-        blank = np.concatenate([np.zeros(2, np.int64), integers[2:]])
+        blank = np.concatenate([np.zeros(3, np.int64), integers[3:]])
         return _with_addresses, (self.plant, self.m, (blank, *rest), *self[3:])
 
 
@@ -81,7 +81,7 @@ def bind(
     if H is not None and (observed.shape != (m, N) or not np.isfinite(observed).all()):
         raise ValueError(f"H needs the shape ({m}, {N}) and finite numbers, not {observed.shape}")
     sizes = (plant.substeps, n_x, len(plant.outputs), n_theta, n_D, p, n_d, m, plant.own_theta, len(plant.commands))
-    integers = np.concatenate([[0, 0, *sizes], *where.values()]).astype(np.int64)
+    integers = np.concatenate([[0, 0, 0, *sizes], *where.values()]).astype(np.int64)
     reals = np.concatenate([[plant.dt], plant.nominal_theta, plant.nominal_p])
     constants = (integers, reals, STEP * size, contiguous(offset), contiguous(direction))
     linear = _linear(plant, where["entries"])
@@ -90,7 +90,7 @@ def bind(
 
 def _with_addresses(plant: Plant, m: int, constants: tuple[Array, ...], *others: Any) -> Model:
     integers, *rest = constants
-    integers = np.concatenate([[plant.addresses.interval, plant.addresses.output], integers[2:]])
+    integers = np.concatenate([[plant.addresses.interval, plant.addresses.output, plant.tangent], integers[3:]])
     return Model(plant, m, (integers, *rest), *others)
 
 

@@ -21,9 +21,15 @@ import numpy as np
 
 from fdi_gym.estimation.gaussian_points import (
     DISTURBANCES,
+    ENTRIES,
     EXTENDED,
+    KNOWN,
+    OWN,
     SIZES,
     STATES,
+    SUBSTEPS,
+    TANGENT,
+    THETA,
     enters,
     factor,
     moments_of_points,
@@ -32,55 +38,9 @@ from fdi_gym.estimation.gaussian_points import (
     squared_step,
 )
 from fdi_gym.kernels import helper
+from fdi_gym.tangent import tangent_at
 
 LOG_2PI = float(np.log(2.0 * np.pi))
-
-
-@helper
-def through(rule, moving, integers, reals, step, offset, direction, t, X, P, u, known, mean, cross, cov):
-    """N(X, P) through f (moving) or h: mean (m,), cov (m, m) and cross (m, N) with what went in."""
-    N, m = X.size, mean.size
-    points, values, first = np.empty((2 * N + 1, N)), np.empty((2 * N + 1, m)), np.empty((N, m))
-    if rule != EXTENDED:
-        U = np.empty((N, N))
-        factor(P, U)
-        spread(X, U, np.sqrt(squared_step(rule, N)), points)
-        pass_points(moving, integers, reals, offset, direction, t, points, u, known, values)
-        low = integers[STATES] if moving else 0  # of f, nobody asks for the covariance with x before
-        moments_of_points(rule, U, low, values, first, mean, cross, cov)
-        return
-    moved = 0  # columns that are not 0
-    for j in range(N):
-        if enters(moving, integers, direction, j):
-            for i in range(N):
-                points[1 + 2 * moved, i] = points[2 + 2 * moved, i] = X[i]
-            points[1 + 2 * moved, j] += step[j]
-            points[2 + 2 * moved, j] -= step[j]
-            moved += 1
-    points[0] = X
-    pass_points(moving, integers, reals, offset, direction, t, points[: 1 + 2 * moved], u, known, values)
-    for a in range(m):
-        mean[a] = values[0, a]
-        for i in range(N):
-            cross[a, i] = 0.0
-    moved = 0
-    for j in range(N):
-        for a in range(m):
-            first[j, a] = 0.0
-        if enters(moving, integers, direction, j):
-            for a in range(m):
-                first[j, a] = (values[1 + 2 * moved, a] - values[2 + 2 * moved, a]) * (0.5 / step[j])
-                for i in range(N):
-                    cross[a, i] += first[j, a] * P[j, i]
-            moved += 1
-    for a in range(m):
-        for b in range(a + 1):
-            cov[a, b] = 0.0
-        for i in range(N):
-            for b in range(a + 1):
-                cov[a, b] += cross[a, i] * first[i, b]
-        for b in range(a):
-            cov[b, a] = cov[a, b]
 
 
 @helper
@@ -103,6 +63,40 @@ def through_matrix(F, P, cross, cov):
                     cov[a, b] += cross[a, j] * F[b, j]
         for a in range(b, m):
             cov[b, a] = cov[a, b]
+
+
+@helper
+def through(rule, moving, integers, reals, step, offset, direction, t, X, P, u, known, mean, cross, cov):
+    """N(X, P) through f (moving) or h: mean (m,), cov (m, m) and cross (m, N) with what went in."""
+    N, m = X.size, mean.size
+    points, values = np.empty((2 * N + 1, N)), np.empty((2 * N + 1, m))
+    if rule != EXTENDED:
+        U, first = np.empty((N, N)), np.empty((N, m))
+        factor(P, U)
+        spread(X, U, np.sqrt(squared_step(rule, N)), points)
+        pass_points(moving, integers, reals, offset, direction, t, points, u, known, values)
+        low = integers[STATES] if moving else 0  # of f, nobody asks for the covariance with x before
+        moments_of_points(rule, U, low, values, first, mean, cross, cov)
+        return
+    moved = 0  # columns that are not 0
+    for j in range(N):
+        if enters(moving, integers, direction, j):
+            for i in range(N):
+                points[1 + 2 * moved, i] = points[2 + 2 * moved, i] = X[i]
+            points[1 + 2 * moved, j] += step[j]
+            points[2 + 2 * moved, j] -= step[j]
+            moved += 1
+    points[0] = X
+    pass_points(moving, integers, reals, offset, direction, t, points[: 1 + 2 * moved], u, known, values)
+    F, moved = np.zeros((m, N)), 0
+    for j in range(N):
+        if enters(moving, integers, direction, j):
+            for a in range(m):
+                F[a, j] = (values[1 + 2 * moved, a] - values[2 + 2 * moved, a]) * (0.5 / step[j])
+            moved += 1
+    for a in range(m):
+        mean[a] = values[0, a]
+    through_matrix(F, P, cross, cov)
 
 
 @helper
@@ -141,6 +135,40 @@ def linearised(integers, offset, direction, plant, X, u, known, F, mean):
 
 
 @helper
+def differentiated(integers, reals, step, offset, direction, t, X, u, known, F, mean):
+    """mean = f(X) and F (n_x, N) its Jacobian, of a plant that says its derivatives."""
+    n, n_theta, own, n_D = integers[STATES], integers[THETA], integers[OWN], integers[KNOWN]
+    p, n_d, n_m, N = integers[ENTRIES], integers[DISTURBANCES], direction.shape[1], step.size
+    now, d = reals[1:].copy(), known.copy()
+    n_p = now.size - n_theta
+    L, used, count = np.zeros((own + n_D + n_p, N)), np.empty(p + n_d, np.int64), 0
+    for e in range(p):
+        i, deviation = integers[SIZES + e], offset[e]
+        for j in range(n_m):
+            deviation += direction[e, j] * X[n + j]
+        now[i] += deviation
+        if i < own or i >= n_theta:  # else it is a fault of a sensor
+            used[count] = i if i < own else own + n_D + i - n_theta
+            for j in range(n_m):
+                L[used[count], n + j] = direction[e, j]
+            count += 1
+    for j in range(n_d):
+        i = integers[SIZES + p + j]
+        d[i] = X[n + n_m + j]
+        used[count] = own + i
+        L[own + i, n + n_m + j] = 1.0
+        count += 1
+    for i in range(n):
+        mean[i] = X[i]
+        for j in range(N):
+            F[i, j] = 1.0 if i == j else 0.0
+    tangent = tangent_at(integers[TANGENT])
+    J, work, k = np.empty(n * (n + own + n_D + n_p)), np.empty((3, n, N)), np.empty((5, n))
+    substeps = integers[SUBSTEPS]
+    tangent(t, reals[0], substeps, mean, u, now[:own], d, now[n_theta:], L, used[:count], step, F, J, work, k)
+
+
+@helper
 def correct_episode(X, P, y, seen, mean, S, cross, U, white, X1, P1, nu, S1):
     """The Kalman correction of one episode by the sensors that reported: nu' S^-1 nu, and the log density of what they read.
 
@@ -157,7 +185,7 @@ def correct_episode(X, P, y, seen, mean, S, cross, U, white, X1, P1, nu, S1):
     factor(S1, U)
     for i in range(N):
         X1[i] = X[i]
-        for j in range(N):
+        for j in range(i + 1):
             P1[i, j] = 0.5 * (P[i, j] + P[j, i])
     distance, log = 0.0, 0.0
     for a in range(m):
@@ -175,8 +203,11 @@ def correct_episode(X, P, y, seen, mean, S, cross, U, white, X1, P1, nu, S1):
             cross[a, i] /= U[a, a]
         for i in range(N):
             X1[i] += white[a] * cross[a, i]
-            for j in range(N):
+            for j in range(i + 1):
                 P1[i, j] -= cross[a, i] * cross[a, j]
         distance += white[a] * white[a]
         log -= 0.5 * LOG_2PI + np.log(U[a, a])
+    for i in range(N):
+        for j in range(i):
+            P1[j, i] = P1[i, j]
     return distance, log - 0.5 * distance

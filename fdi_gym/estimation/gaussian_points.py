@@ -12,8 +12,10 @@ from fdi_gym.kernels import helper, map_at
 
 EXTENDED, UNSCENTED, CENTRAL_DIFFERENCE = 0, 1, 2
 JITTER, RETRIES = 1e-14, 7  # added to the diagonal where the factorisation fails, times 100 at each retry
-# The integers of a model: two addresses, then sizes, then the lists of positions (entries, disturbances, sensors)
-INTERVAL, OUTPUT, SUBSTEPS, STATES, OUTPUTS, THETA, KNOWN, ENTRIES, DISTURBANCES, SENSORS, OWN, COMMANDS, SIZES = range(13)
+# The integers of a model: three addresses (the third may be 0), sizes, then the lists (entries, disturbances, sensors)
+INTERVAL, OUTPUT, TANGENT, SUBSTEPS, STATES, OUTPUTS, THETA, KNOWN, ENTRIES, DISTURBANCES, SENSORS, OWN, COMMANDS, SIZES = (
+    range(14)
+)
 
 
 @helper
@@ -36,13 +38,15 @@ def pass_points(moving, integers, reals, offset, direction, t, points, u, known,
     d = known.copy()
     work = np.empty((5, n_x))
     for i in range(points.shape[0]):
-        for e in range(p):
-            now[entries[e]] = nominal[entries[e]]
-        for e in range(p):
-            deviation = offset[e]
-            for j in range(n_m):
-                deviation += direction[e, j] * points[i, n_x + j]
-            now[entries[e]] += deviation
+        moved = i == 0
+        for j in range(n_x, n_x + n_m):
+            moved = moved or points[i, j] != points[i - 1, j]
+        if moved:  # the magnitudes, of which most points have those of the one before
+            for e in range(p):
+                deviation = offset[e]
+                for j in range(n_m):
+                    deviation += direction[e, j] * points[i, n_x + j]
+                now[entries[e]] = nominal[entries[e]] + deviation
         for j in range(n_d):
             d[disturbances[j]] = points[i, n_x + n_m + j]
         for j in range(n_x):

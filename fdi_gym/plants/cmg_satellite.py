@@ -183,6 +183,65 @@ def dynamics(t, x, u, theta, d, p, dx):
 
 
 @kernel
+def cross(a1, a2, a3, b1, b2, b3):
+    """a x b."""
+    return a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1
+
+
+@kernel
+def rate_column(J, j, C, b1, b2, b3):
+    """Column j of J in the rows of w': M^-1 b, with the rows C of M^-1."""
+    for i in range(3):
+        J[4 + i, j] = C[i][0] * b1 + C[i][1] * b2 + C[i][2] * b3
+
+
+@kernel
+def jacobian(t, x, u, theta, d, p, J_x, J_theta, J_d, J_p):
+    """The derivatives of `dynamics`: M w' = b gives dw'/dz = M^-1 (db/dz - dM/dz w'), and dE/dd = A, dA/dd = -E."""
+    A, E = _pyramid(x[7] + p[3], x[8] + p[4], x[9] + p[5], x[10] + p[6])
+    q1, q2, q3, q4, w1, w2, w3 = x[0], x[1], x[2], x[3], x[4], x[5], x[6]
+    J_x[0, 4], J_x[0, 5], J_x[0, 6] = 0.5 * q4, -0.5 * q3, 0.5 * q2
+    J_x[1, 4], J_x[1, 5], J_x[1, 6] = 0.5 * q3, 0.5 * q4, -0.5 * q1
+    J_x[2, 4], J_x[2, 5], J_x[2, 6] = -0.5 * q2, 0.5 * q1, 0.5 * q4
+    J_x[3, 4], J_x[3, 5], J_x[3, 6] = -0.5 * q1, -0.5 * q2, -0.5 * q3
+    J_x[0, 1], J_x[0, 2], J_x[0, 3] = 0.5 * w3, -0.5 * w2, 0.5 * w1
+    J_x[1, 0], J_x[1, 2], J_x[1, 3] = -0.5 * w3, 0.5 * w1, 0.5 * w2
+    J_x[2, 0], J_x[2, 1], J_x[2, 3] = 0.5 * w2, -0.5 * w1, 0.5 * w3
+    J_x[3, 0], J_x[3, 1], J_x[3, 2] = -0.5 * w1, -0.5 * w2, -0.5 * w3
+
+    wheel, g = 0.0, (1.0, 1.0, 1.0, 1.0)
+    if p[7] > 0.0:
+        wheel, g = 1.0, (theta[0], theta[1], theta[2], theta[3])
+    r = (theta[0] * u[0], theta[1] * u[1], theta[2] * u[2], theta[3] * u[3])
+    l1 = p[0] * w1 + H0 * dot4(E[0], *g)
+    l2 = p[1] * w2 + H0 * dot4(E[1], *g)
+    l3 = p[2] * w3 + H0 * dot4(E[2], *g)
+    n1, n2, n3 = cross(l1, l2, l3, w1, w2, w3)
+    b1, b2, b3 = n1 - H0 * dot4(A[0], *r), n2 - H0 * dot4(A[1], *r), n3 - H0 * dot4(A[2], *r)
+    m11, m12, m13, m22, m23, m33 = gram(A)
+    M = (p[0] - JW * m11, -JW * m12, -JW * m13, p[1] - JW * m22, -JW * m23, p[2] - JW * m33)
+    C = (solve3(*M, 1.0, 0.0, 0.0), solve3(*M, 0.0, 1.0, 0.0), solve3(*M, 0.0, 0.0, 1.0))
+    z1, z2, z3, _ = solve3(*M, b1, b2, b3)  # w'
+
+    rate_column(J_x, 4, C, 0.0, l3 - p[0] * w3, p[0] * w2 - l2)
+    rate_column(J_x, 5, C, p[1] * w3 - l3, 0.0, l1 - p[1] * w1)
+    rate_column(J_x, 6, C, l2 - p[2] * w2, p[2] * w1 - l1, 0.0)
+    rate_column(J_p, 0, C, -z1, -w1 * w3, w1 * w2)
+    rate_column(J_p, 1, C, w2 * w3, -z2, -w1 * w2)
+    rate_column(J_p, 2, C, -w2 * w3, w1 * w3, -z3)
+    for i in range(4):
+        a1, a2, a3, e1, e2, e3 = A[0][i], A[1][i], A[2][i], E[0][i], E[1][i], E[2][i]
+        v1, v2, v3 = cross(w1, w2, w3, e1, e2, e3)
+        k, s = H0 * u[i], H0 * wheel
+        rate_column(J_theta, i, C, -k * a1 - s * v1, -k * a2 - s * v2, -k * a3 - s * v3)
+        v1, v2, v3 = cross(w1, w2, w3, a1, a2, a3)
+        k, s = H0 * r[i] - JW * (a1 * z1 + a2 * z2 + a3 * z3), JW * (e1 * z1 + e2 * z2 + e3 * z3)
+        b1, b2, b3 = k * e1 - s * a1 - H0 * g[i] * v1, k * e2 - s * a2 - H0 * g[i] * v2, k * e3 - s * a3 - H0 * g[i] * v3
+        rate_column(J_x, 7 + i, C, b1, b2, b3)
+        rate_column(J_p, 3 + i, C, b1, b2, b3)
+
+
+@kernel
 def project(x, theta):
     """The quaternion keeps its length; its sign is left alone."""
     norm = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2] + x[3] * x[3])
@@ -576,7 +635,7 @@ def plant(
         id=ID, version=VERSION, options=options,
         description="Satellite with four control moment gyros: loss of effectiveness of any subset",
         dt=DT, substeps=1,
-        kernels=Kernels(dynamics, output, control, known, project, outside),
+        kernels=Kernels(dynamics, output, control, known, project, outside, jacobian=jacobian),
         states=(*attitude, *w, *d),
         outputs=(*(s._replace(sigma=float(v), nominal=0.0) for s, v in zip(seen, sigma, strict=True)),
                  Signal("sign q4", "", -1.0, 1.0)),

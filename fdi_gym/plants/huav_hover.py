@@ -130,7 +130,20 @@ INTEGRAL_CLIP = 1.0  # m, rad s: with 5 the recovery of a floating cyclic overtu
 def thrust(slope, inflow, angle):
     """T of T + inflow sqrt(T) = slope angle; zero below zero blade angle."""
     lift = slope * max(angle, 0.0)
-    return lift + 0.5 * inflow * inflow - inflow * np.sqrt(lift + 0.25 * inflow * inflow)
+    T = lift + 0.5 * inflow * inflow - inflow * np.sqrt(lift + 0.25 * inflow * inflow)
+    return max(T, 0.0)  # rounding can leave less
+
+
+@kernel
+def thrust_slope(slope, inflow, root):
+    """dT/d angle where sqrt(T) = root; zero below zero blade angle, as T is."""
+    return slope * root / (root + 0.5 * inflow)
+
+
+@kernel
+def act(J_theta, i, j, u, slope):
+    """d dx[i] / d angle of actuator j = slope: enter it for gain and offset."""
+    J_theta[i, j], J_theta[i, 4 + j] = u[j] * slope, slope
 
 
 @kernel
@@ -163,6 +176,63 @@ def dynamics(t, x, u, theta, d, p, dx):
     dx[8] = psi_rate
     dx[9] = -pitch_rate + (k_h * lon - a1f) * PER_TAU_F
     dx[10] = -roll_rate + (k_h * lat - b1f) * PER_TAU_F
+
+
+@kernel
+def jacobian(t, x, u, theta, d, p, J_x, J_theta, J_d, J_p):
+    """The derivatives of `dynamics`; dtm is d tm / d col, and so on."""
+    pitch_rate, yaw_rate, phi, pitch = x[4], x[5], x[6], x[7]
+    col, lon = theta[0] * u[0] + theta[4], theta[1] * u[1] + theta[5]
+    lat, ped = theta[2] * u[2] + theta[6], theta[3] * u[3] + theta[7]
+    per_m, per_jxx, per_jyy, per_jzz, k_b, k_h = p[0], p[1], p[2], p[3], p[4], p[5]
+
+    tm, tt = thrust(CT_M, DT_M, col), thrust(CT_T, DT_T, ped + OFFSET_PED)
+    root_m, root_t = np.sqrt(tm), np.sqrt(tt)
+    dtm, dtt = thrust_slope(CT_M, DT_M, root_m), thrust_slope(CT_T, DT_T, root_t)
+    a1, b1 = k_b * lon + K_F * x[9], k_b * lat + K_F * x[10]
+    hub = tm * H_MR + K_BETA
+    force, roll, tilt = tm * per_m, hub * per_jxx, hub * per_jyy  # per radian of a1 or b1
+    sin_phi, cos_phi, sin_pitch, cos_pitch = np.sin(phi), np.cos(phi), np.sin(pitch), np.cos(pitch)
+    sec, tan = 1.0 / cos_pitch, sin_pitch / cos_pitch
+    nod = pitch_rate * cos_phi - yaw_rate * sin_phi  # dx[7]
+    turn = pitch_rate * sin_phi + yaw_rate * cos_phi  # cos_pitch dx[8]
+
+    J_x[0, 7], J_x[0, 9] = -G * cos_pitch, -force * K_F
+    J_x[1, 6], J_x[1, 7], J_x[1, 10] = G * cos_phi * cos_pitch, -G * sin_phi * sin_pitch, force * K_F
+    J_x[2, 6], J_x[2, 7] = -G * sin_phi * cos_pitch, -G * cos_phi * sin_pitch
+    J_x[3, 10], J_x[4, 9] = roll * K_F, tilt * K_F
+    J_x[6, 3], J_x[6, 4], J_x[6, 5] = 1.0, tan * sin_phi, tan * cos_phi
+    J_x[6, 6], J_x[6, 7] = tan * nod, turn * sec * sec
+    J_x[7, 4], J_x[7, 5], J_x[7, 6] = cos_phi, -sin_phi, -turn
+    J_x[8, 4], J_x[8, 5], J_x[8, 6], J_x[8, 7] = sec * sin_phi, sec * cos_phi, sec * nod, turn * sec * tan
+    J_x[9, 4], J_x[9, 9] = -1.0, -PER_TAU_F
+    J_x[10, 3], J_x[10, 10] = -1.0, -PER_TAU_F
+
+    act(J_theta, 0, 0, u, -dtm * a1 * per_m)
+    act(J_theta, 1, 0, u, dtm * b1 * per_m)
+    act(J_theta, 2, 0, u, -dtm * per_m)
+    act(J_theta, 3, 0, u, dtm * H_MR * b1 * per_jxx)
+    act(J_theta, 4, 0, u, dtm * H_MR * a1 * per_jyy)
+    act(J_theta, 5, 0, u, -1.5 * CQ_M * root_m * dtm * per_jzz)
+    act(J_theta, 0, 1, u, -force * k_b)
+    act(J_theta, 4, 1, u, tilt * k_b)
+    act(J_theta, 9, 1, u, k_h * PER_TAU_F)
+    act(J_theta, 1, 2, u, force * k_b)
+    act(J_theta, 3, 2, u, roll * k_b)
+    act(J_theta, 10, 2, u, k_h * PER_TAU_F)
+    act(J_theta, 1, 3, u, -dtt * per_m)
+    act(J_theta, 3, 3, u, -H_TR * dtt * per_jxx)
+    act(J_theta, 4, 3, u, -1.5 * CQ_T * root_t * dtt * per_jyy)
+    act(J_theta, 5, 3, u, D_TR * dtt * per_jzz)
+
+    J_d[0, 0], J_d[1, 1], J_d[3, 1], J_d[5, 1] = p[6], p[7], p[8], p[9]
+
+    J_p[0, 0], J_p[1, 0], J_p[2, 0] = -tm * a1, tm * b1 - tt, -tm
+    J_p[3, 1], J_p[4, 2] = hub * b1 - H_TR * tt, hub * a1 - CQ_T * tt * root_t - DQ_T
+    J_p[5, 3] = D_TR * tt - CQ_M * tm * root_m - DQ_M
+    J_p[0, 4], J_p[1, 4], J_p[3, 4], J_p[4, 4] = -force * lon, force * lat, roll * lat, tilt * lon
+    J_p[9, 5], J_p[10, 5] = lon * PER_TAU_F, lat * PER_TAU_F
+    J_p[0, 6], J_p[1, 7], J_p[3, 8], J_p[5, 9] = d[0], d[1], d[1], d[1]
 
 
 @kernel
@@ -581,7 +651,7 @@ def plant(*, kappa: float = 0.3, K_B: float = 0.84) -> Plant:
         id=ID, version=VERSION, options={"kappa": kappa, "K_B": K_B},
         description="helicopter UAV in hover: actuator faults under wind gusts",
         dt=DT, substeps=1,
-        kernels=Kernels(dynamics, output, control, outside=outside),
+        kernels=Kernels(dynamics, output, control, outside=outside, jacobian=jacobian),
         states=tuple(Signal(n, unit, -high, high, scale, w, float(x)) for n, unit, high, scale, w, x in zip(
             STATES, units, lim, scales, SIGMA_W, x_trim, strict=True)),
         outputs=tuple(Signal(n, unit, -high, high, scale, v, float(x)) for n, unit, high, scale, v, x in zip(

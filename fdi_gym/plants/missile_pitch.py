@@ -129,13 +129,51 @@ def dynamics(t, x, u, theta, d, p, dx):
     Z_1 = K1 * K_Q * mach * mach * abs(B_M) * alpha * abs(alpha)
     dx[0] = K_ALPHA * mach * np.cos(alpha) * normal(mach, alpha, delta, theta, p) + q
     dx[1] = K_Q * mach * mach * C_m + (1.0 - theta[4]) * L_J * jet + theta[0] * Z_1
-    if theta[1] != 0.0:  # a quarter of the time of a flight would go into an exponential that counts for nothing
+    if theta[1] != 0.0:  # a tenth of the time of a flight would go into an exponential that counts for nothing
         Z_2 = L2 * np.exp(-((alpha / ALPHA_J) ** 2))
         dx[1] += theta[1] * Z_2
     dx[2], dx[3] = delta_dot, OMEGA_F * OMEGA_F * (u[0] - delta) - 2.0 * ZETA_F * OMEGA_F * delta_dot
     if theta[3] >= 0.5:
         dx[2], dx[3] = 0.0, 0.0
     dx[4] = (u[1] - jet) / TAU_J
+
+
+@kernel
+def jacobian(t, x, u, theta, d, p, J_x, J_theta, J_d, J_p):
+    """Partial derivatives of `dynamics`."""
+    alpha, delta, size = x[0], x[2], abs(x[0])
+    mach = MACH + d[0] + d[1] * t
+    fin, pitching, lifting = 1.0 - theta[2], K_Q * mach * mach, K_ALPHA * mach * np.cos(alpha)
+    a_n, b_n, c_n, d_n = A_N * (1.0 + p[0]), B_N * (1.0 + p[1]), C_N * (1.0 + p[2]), D_N * (1.0 + p[6])
+    a_m, b_m, c_m, d_m = A_M * (1.0 + p[3]), B_M * (1.0 + p[4]), C_M * (1.0 + p[5]), D_M * (1.0 + p[7])
+    C_n, C_m0 = normal(mach, alpha, delta, theta, p), moment(alpha, mach, a_m, b_m, c_m)
+    C_m = C_m0 + fin * d_m * delta
+    aero, leak = K1 * K_Q * abs(B_M) * alpha * size, L2 * np.exp(-((alpha / ALPHA_J) ** 2))
+
+    by_alpha_n = 3.0 * a_n * alpha * alpha + 2.0 * b_n * size + c_n * (2.0 - mach / 3.0)
+    by_alpha_m = 3.0 * a_m * alpha * alpha + 2.0 * b_m * size + c_m * (-7.0 + 8.0 * mach / 3.0)
+    J_x[0, 0] = lifting * by_alpha_n - K_ALPHA * mach * np.sin(alpha) * C_n
+    J_x[0, 1], J_x[0, 2] = 1.0, lifting * fin * d_n
+    J_x[1, 0] = pitching * (by_alpha_m + theta[0] * 2.0 * K1 * abs(B_M) * size)
+    J_x[1, 0] -= theta[1] * leak * 2.0 * alpha / (ALPHA_J * ALPHA_J)
+    J_x[1, 2], J_x[1, 4] = pitching * fin * d_m, (1.0 - theta[4]) * L_J
+    if theta[3] < 0.5:
+        J_x[2, 3], J_x[3, 2], J_x[3, 3] = 1.0, -OMEGA_F * OMEGA_F, -2.0 * ZETA_F * OMEGA_F
+    J_x[4, 4] = -1.0 / TAU_J
+
+    J_theta[0, 2] = -lifting * d_n * delta
+    J_theta[1, 0], J_theta[1, 1] = aero * mach * mach, leak
+    J_theta[1, 2], J_theta[1, 4] = -pitching * d_m * delta, -L_J * x[4]
+
+    by_mach_n = K_ALPHA * np.cos(alpha) * (C_n - mach * c_n * alpha / 3.0)
+    by_mach_m = 2.0 * K_Q * mach * C_m + pitching * c_m * alpha * 8.0 / 3.0 + theta[0] * 2.0 * aero * mach
+    J_d[0, 0], J_d[0, 1], J_d[1, 0], J_d[1, 1] = by_mach_n, by_mach_n * t, by_mach_m, by_mach_m * t
+
+    cube, square = alpha * alpha * alpha, alpha * size
+    J_p[0, 0], J_p[0, 1] = lifting * A_N * cube, lifting * B_N * square
+    J_p[0, 2], J_p[0, 6] = lifting * C_N * (2.0 - mach / 3.0) * alpha, lifting * fin * D_N * delta
+    J_p[1, 3], J_p[1, 4] = pitching * A_M * cube, pitching * B_M * square
+    J_p[1, 5], J_p[1, 7] = pitching * C_M * (-7.0 + 8.0 * mach / 3.0) * alpha, pitching * fin * D_M * delta
 
 
 @kernel
@@ -467,7 +505,7 @@ def plant(*, noise_scale: float = 1.0, fault_scale: float = 1.0) -> Plant:
         id=ID, version=VERSION, options={"noise_scale": noise_scale, "fault_scale": fault_scale},
         description="Tail-controlled missile, pitch axis in closed loop: aerodynamic, fin and jet faults",
         dt=DT, substeps=SUBSTEPS,
-        kernels=Kernels(dynamics, output, control, known, project, outside),
+        kernels=Kernels(dynamics, output, control, known, project, outside, jacobian),
         states=(
             Signal("alpha", "rad", -ALPHA_MAX, ALPHA_MAX, 0.35), Signal("q", "rad/s", -Q_MAX, Q_MAX, 1.0),
             Signal("delta", "rad", -np.pi / 4, np.pi / 4, 0.52), Signal("delta_dot", "rad/s", -150.0, 150.0, 5.0),

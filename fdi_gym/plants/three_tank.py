@@ -73,6 +73,7 @@ AREA, PIPE = 0.0154, 5e-5  # m^2, cross-sections of a tank and of a pipe
 G = 9.81  # m/s^2
 AZ = {"az13": 0.46, "az32": 0.48, "az20": 0.58}  # outflow coefficients
 U_MAX = 1.2e-4  # m^3/s
+LEVEL = 1e-4  # m: two levels that differ by less pass for equal in the derivative of a flow
 KP, KI = 5e-4, 5e-6  # m^2/s, m^2/s^2
 TAU_D = 100.0  # s: drain
 
@@ -113,6 +114,36 @@ def dynamics(t, x, u, theta, d, p, dx):
     dx[0] = (eta1 * u[0] - q13 - flow(l1, h1)) / AREA
     dx[1] = (eta2 * u[1] + q32 - q20 - flow(l2, h2)) / AREA
     dx[2] = (q13 - q32 - flow(l3, h3)) / AREA
+
+
+@kernel
+def slope(s, h):
+    """ds/dh where s(1, h) / A = s. It has no bound at h = 0: nearer than LEVEL it is what it is there."""
+    return 0.5 * abs(s) / abs(h) if abs(h) > LEVEL else 0.5 * flow(1.0, LEVEL) / LEVEL / AREA
+
+
+@kernel
+def jacobian(t, x, u, theta, d, p, J_x, J_theta, J_d, J_p):
+    """Partial derivatives of `dynamics`."""
+    h1, h2, h3 = max(x[0], 0.0), max(x[1], 0.0), max(x[2], 0.0)
+    l1, l2, l3, c13, c32 = theta[0], theta[1], theta[2], theta[5], theta[6]
+    f13, f32 = flow(1.0, h1 - h3) / AREA, flow(1.0, h3 - h2) / AREA
+    f1, f2, f3 = flow(1.0, h1) / AREA, flow(1.0, h2) / AREA, flow(1.0, h3) / AREA
+    s13, s32 = p[0] * (1.0 - c13) * slope(f13, h1 - h3), p[1] * (1.0 - c32) * slope(f32, h3 - h2)
+    if x[0] >= 0.0:
+        J_x[0, 0], J_x[2, 0] = -s13 - l1 * slope(f1, h1), s13
+    if x[1] >= 0.0:
+        J_x[1, 1], J_x[2, 1] = -s32 - (p[2] * (1.0 + d[0]) + l2) * slope(f2, h2), s32
+    if x[2] >= 0.0:
+        J_x[0, 2], J_x[1, 2], J_x[2, 2] = s13, s32, -s13 - s32 - l3 * slope(f3, h3)
+    J_theta[0, 0], J_theta[1, 1], J_theta[2, 2] = -f1, -f2, -f3
+    J_theta[0, 3], J_theta[1, 4] = u[0] / AREA, u[1] / AREA
+    J_theta[0, 5], J_theta[2, 5] = p[0] * f13, -p[0] * f13
+    J_theta[1, 6], J_theta[2, 6] = -p[1] * f32, p[1] * f32
+    J_d[1, 0] = -p[2] * f2
+    J_p[0, 0], J_p[2, 0] = -(1.0 - c13) * f13, (1.0 - c13) * f13
+    J_p[1, 1], J_p[2, 1] = (1.0 - c32) * f32, -(1.0 - c32) * f32
+    J_p[1, 2] = -(1.0 + d[0]) * f2
 
 
 @kernel
@@ -304,7 +335,7 @@ def plant() -> Plant:
     return Plant(
         id=ID, version=VERSION, description="Three coupled tanks under level control: leaks, weak pumps, plugged pipes",
         dt=DT, substeps=SUBSTEPS,
-        kernels=Kernels(dynamics, output, control, known, outside=outside),
+        kernels=Kernels(dynamics, output, control, known, outside=outside, jacobian=jacobian),
         states=tuple(Signal(f"h{i + 1}", "m", 0.0, OVERFLOW, 0.05, SIGMA_W, h) for i, h in enumerate(X_TRIM.tolist())),
         outputs=tuple(Signal(f"h{i + 1}", "m", -0.1, 0.8, 0.05, SIGMA_V, h) for i, h in enumerate(X_TRIM.tolist())),
         commands=tuple(Signal(f"u{i + 1}", "m^3/s", 0.0, U_MAX, 2e-5, 0.0, u) for i, u in enumerate(U_TRIM.tolist())),

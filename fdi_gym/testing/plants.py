@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +11,9 @@ from fdi_gym.bounds import check_bounds_at
 from fdi_gym.checks import check_declaration
 from fdi_gym.engine import Record, no_noise, simulate
 from fdi_gym.faults import Fault, FaultScenario, Incipient, Intermittent, draw
-from fdi_gym.plant import Array, Plant, Signal
+from fdi_gym.kernels import load
+from fdi_gym.model import contiguous
+from fdi_gym.plant import Array, Kernels, Plant, Signal
 
 
 def check_plant(plant: Plant, seeds: Sequence[int] = range(5)) -> None:
@@ -19,7 +22,8 @@ def check_plant(plant: Plant, seeds: Sequence[int] = range(5)) -> None:
     Names are unique, scales positive, bands in order. Scenarios fit the plant, survive JSON and replay to the same
     flight. While modes are active, the estimated quantity is healthy plus a point of each mode's line, within its reach;
     theta, target and observations stay in their ranges; labels, target and theta agree. The healthy plant is what the
-    model predicts, and linear, and its disturbance measured, where it says so. The kernels stay within their arrays.
+    model predicts, and linear, and its disturbance measured, where it says so. The kernels stay within their arrays, and the
+    derivatives that they say are those of its equations.
 
     Args:
         plant: The plant.
@@ -51,6 +55,8 @@ def check_plant(plant: Plant, seeds: Sequence[int] = range(5)) -> None:
     _check_model(plant, draw(standard, seeds[0]))
     if plant.linear:
         _check_linear(plant)
+    if plant.kernels is not None and plant.kernels.jacobian is not None:
+        _check_jacobian(plant, plant.kernels, simulate(plant, [draw(standard, seed) for seed in seeds]))
 
 
 def _check_range(what: str, signals: Sequence[Signal], values: Array) -> None:
@@ -162,6 +168,48 @@ def _check_model(plant: Plant, scenario: FaultScenario) -> None:
     predicted = plant.propagate(t, record.state[0, :steps], u[1 : steps + 1], None, d)
     error = np.abs(predicted - record.state[0, 1 : steps + 1]).max()
     assert error <= 1e-12 * max(1.0, np.abs(record.state[0]).max()), f"the model is not the plant: off by {error:.3g}"
+
+
+def _check_jacobian(plant: Plant, kernels: Kernels, record: Record) -> None:
+    """The partial derivatives are what differences of the dynamics say, at some samples of each flight.
+
+    Where a wider difference says something else there is a kink or a jump, and nothing is judged.
+    """
+    load(kernels.dynamics)
+    jacobian, own, n_x = load(kernels.jacobian), plant.theta[: plant.own_theta], len(plant.states)
+    rates = np.array([s.scale for s in plant.states]) / (plant.dt if plant.substeps else 1.0)
+    sizes = [
+        [s.scale for s in plant.states], [s.scale for s in own], [s.scale for s in plant.disturbances],
+        np.maximum(np.abs(plant.nominal_p), 1e-3).tolist(),
+    ]  # fmt: skip
+    _, u, _ = plant.split(record.obs)
+    samples = [(i, k) for i, last in enumerate(record.length.tolist()) for k in range(1, last + 1, max(last // 8, 1))]
+    for i, k in samples:
+        t, command = k * plant.dt, contiguous(u[i, k])
+        at = [record.state[i, k], record.theta[i, k, : len(own)], np.zeros(len(sizes[2])), plant.nominal_p]
+        at = [contiguous(value) for value in at]
+        said = [np.zeros((n_x, len(value))) for value in at]
+        jacobian(t, at[0], command, *at[1:], *said)
+        for place, j in ((place, j) for place, value in enumerate(at) for j in range(len(value))):
+            size = sizes[place][j]
+            wide, narrow = (_difference(kernels.dynamics, t, command, at, place, j, step * size) for step in (1e-4, 1e-6))
+            smooth = np.abs(wide - narrow) * size / rates < 1e-5
+            off = np.where(smooth, np.abs(said[place][:, j] - narrow) * size / rates, 0.0)
+            a = int(np.argmax(off))
+            assert off[a] < 1e-4, (
+                f"the kernel 'jacobian' says that d dx[{a}] / d {('x', 'theta', 'd', 'p')[place]}[{j}] is "
+                f"{said[place][a, j]:.6g} at sample {k} of flight {i}; differences of 'dynamics' say {narrow[a]:.6g}"
+            )
+
+
+def _difference(dynamics: Any, t: float, u: Array, at: Sequence[Array], place: int, j: int, step: float) -> Array:
+    """Central difference (n_x,) of the dynamics at (x, theta, d, p) along entry j of one of them."""
+    ends = np.zeros((2, len(at[0])))
+    for end, sign in zip(ends, (1.0, -1.0), strict=True):
+        x, theta, d, p = (value.copy() for value in at)
+        (x, theta, d, p)[place][j] += sign * step
+        dynamics(t, x, u, theta, d, p, end)
+    return (ends[0] - ends[1]) / (2 * step)
 
 
 def _check_linear(plant: Plant) -> None:
