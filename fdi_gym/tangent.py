@@ -13,6 +13,7 @@ from numba import float64, int64, void
 
 from fdi_gym.kernels import M, V, around, function_at, helper
 
+FINE = 1e-2  # of a step of the differences along the axes: that along which the projection is tried
 I1, M3 = int64[::1], float64[:, :, ::1]
 _TANGENT = void(float64, float64, int64, V, V, V, V, V, M, I1, V, M, V, M3, M)
 tangent_at = function_at(_TANGENT)
@@ -84,12 +85,13 @@ def _around(dynamics: Any, jacobian: Any, *manifold: Any) -> Any:
                 V[:], x[:] = total, k[0]
         if curved:
             for j in range(N):  # the projection, by differences along each column
+                small = FINE * step[j]
                 for i in range(n):
-                    z[i], k[0, i] = x[i] + step[j] * V[i, j], x[i] - step[j] * V[i, j]
+                    z[i], k[0, i] = x[i] + small * V[i, j], x[i] - small * V[i, j]
                 project(z, theta)
                 project(k[0], theta)
                 for i in range(n):
-                    V[i, j] = (z[i] - k[0, i]) / (2.0 * step[j])
+                    V[i, j] = (z[i] - k[0, i]) / (2.0 * small)
             project(x, theta)
 
     return tangent
@@ -99,7 +101,7 @@ def tangent(dynamics: Any, jacobian: Any, project: Any = None) -> Any:
     """The kernel that moves a state and small deviations over an interval, compiled around a plant's own; see `tangent_at`.
 
     Its arguments: t, dt, substeps, x, u, theta, d, p as of `integration.interval`, theta held; L (n_theta + n_d + n_p, N),
-    which of its rows are not 0, the size of each column's deviation (N,) at which the projection is tried, and V (n_x, N).
+    which of its rows are not 0, the steps (N,) of differences along the columns, and V (n_x, N).
     It moves x and V on to t + dt. The rest is for it to use: J (n_x (n_x + n_theta + n_d + n_p),), work (3, n_x, N) and
     k (5, n_x).
     """

@@ -20,15 +20,37 @@ def dynamics(t, x, u, theta, d, p, dx):
 
 
 @kernel
+def jacobian(t, x, u, theta, d, p, J_x, J_theta, J_d, J_p):
+    """Their derivatives."""
+    J_x[0, 0], J_x[0, 1] = -x[1], -x[0]
+    J_x[1, 0], J_x[1, 1] = theta[1], -np.sin(t)
+    J_theta[0, 0], J_theta[1, 1], J_theta[1, 2] = u[0] * np.cos(t), x[0], d[0]
+    J_d[0, 0], J_d[1, 0] = 1.0, theta[2]
+
+
+@kernel
+def project(x, theta):
+    """Onto a curve."""
+    size = np.sqrt(1.0 + (x[0] / 50.0) ** 2 + (x[1] / 500.0) ** 2)
+    x[0] /= size
+    x[1] /= size
+
+
+@kernel
 def output(t, x, u, theta, d, p, y):
     """The same."""
     y[0] = x[0] * np.cos(t) + theta[2] + 0.1 * u[0]
     y[1] = x[0] * x[1] + t + d[0]
 
 
-CLOCK = dataclasses.replace(build("DCMotor"), kernels=build("DCMotor").kernels._replace(dynamics=dynamics, output=output))
+KERNELS = build("DCMotor").kernels._replace(dynamics=dynamics, output=output, jacobian=jacobian)
+CLOCKS = {
+    "clock": dataclasses.replace(build("DCMotor"), kernels=KERNELS),
+    "clock on a curve": dataclasses.replace(build("DCMotor"), kernels=KERNELS._replace(project=project), substeps=3),
+    "discrete clock": dataclasses.replace(build("DCMotor"), kernels=KERNELS, substeps=0),
+}
 ALL_PLANTS = [*PLANTS, "DCMotor", "clock"]
-DIFFERENTIATED = [plant_id for plant_id in PLANTS if build(plant_id).kernels.jacobian is not None]
+DIFFERENTIATED = [plant_id for plant_id in PLANTS if build(plant_id).kernels.jacobian is not None] + list(CLOCKS)
 EPISODES = 6
 TOLERANCE = 1e-10  # in units of standard deviations
 
@@ -41,7 +63,7 @@ class Case:
     """
 
     def __init__(self, plant_id, lines=None, n=EPISODES, seed=0, derivatives=False):
-        plant = CLOCK if plant_id == "clock" else build(plant_id)
+        plant = CLOCKS.get(plant_id) or build(plant_id)
         if not derivatives:
             plant = dataclasses.replace(plant, kernels=plant.kernels._replace(jacobian=None))
         self.plant = plant

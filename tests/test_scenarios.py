@@ -611,3 +611,37 @@ def test_mutated_scenarios_are_refused_or_fly():
 @pytest.mark.slow
 def test_many_mutated_scenarios_are_refused_or_fly():
     fuzz(30_000, seed=1)
+
+
+def derivatives(of_x=1.0, of_theta=1.0, of_d=1.0, of_p=1.0, row=1):
+    """The motor's, some of them times a factor."""
+    from fdi_gym.kernels import kernel
+
+    @kernel
+    def jacobian(t, x, u, theta, d, p, J_x, J_theta, J_d, J_p):
+        J_x[0, 0], J_x[0, 1] = -(p[0] + theta[1]) / 5e-3, -0.05 / 5e-3
+        J_x[1, 0], J_x[row, 1] = of_x * 0.05 / 2e-4, -1e-4 / 2e-4
+        J_theta[0, 0], J_theta[0, 1] = u[0] / 5e-3, -of_theta * x[0] / 5e-3
+        J_d[1, 0], J_p[0, 0] = -of_d / 2e-4, -of_p * x[0] / 5e-3
+
+    return jacobian
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({}, None),
+        ({"of_x": -1.0}, r"d dx\[1\] / d x\[0\] is -250 .* say 250$"),
+        ({"of_theta": 1.01}, r"d dx\[0\] / d theta\[1\] is"),
+        ({"of_d": -1.0}, r"d dx\[1\] / d d\[0\] is 5000 .* say -5000$"),
+        ({"of_p": 0.0}, r"d dx\[0\] / d p\[0\] is -?0 "),
+        ({"row": 2}, "'jacobian' reaches beyond its arrays.*J_x 2 by 2"),
+    ],
+)
+def test_check_plant_compares_the_derivatives_with_the_dynamics(motor, changes, match):
+    plant = dataclasses.replace(motor, kernels=motor.kernels._replace(jacobian=derivatives(**changes)))
+    if match is None:
+        check_plant(plant, seeds=range(2))
+        return
+    with pytest.raises((AssertionError, ValueError), match=match):
+        check_plant(plant, seeds=range(2))

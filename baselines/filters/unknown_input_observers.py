@@ -133,8 +133,8 @@ def _missing(A: Array, E: Array, C: Array, H: Array) -> str:
     return ""
 
 
-def bank_filter(plant: Plant, model: AugmentedModel, size: Array, observers: Observers, paces: Sequence[float]) -> Filter:
-    """The bank.
+class _Functions:
+    """The filter's functions.
 
     Args:
         plant: The plant.
@@ -143,57 +143,65 @@ def bank_filter(plant: Plant, model: AugmentedModel, size: Array, observers: Obs
         observers: Which observers there are.
         paces: Samples within which each of the sums forgets.
     """
-    about = local(model, size)
-    b, p, n_x, m, q = len(observers.labels), len(size), len(plant.states), len(model.R), len(model.disturbances)
-    inputs, keep = np.concatenate([size, model.scale[model.d]]), 1.0 - 1.0 / np.asarray(paces, float)
-    blind = observers.blind.astype(float)
-    Q, x, sets, labels = model.Q[model.x, model.x], model.x, manifolds(plant), len(plant.labels)
-    each = [Manifolds(*(a[sets.labels == label] for a in sets)) for label in observers.labels]
-    N = len(model.scale)
 
-    def start(n: int) -> Bank:
+    def __init__(self, plant: Plant, model: AugmentedModel, size: Array, observers: Observers, paces: Sequence[float]):
+        self.plant, self.model, self.size, self.observers = plant, model, size, observers
+        self.about = local(model, size)
+        self.b, self.p, self.q = len(observers.labels), len(size), len(model.disturbances)
+        self.inputs, self.keep = np.concatenate([size, model.scale[model.d]]), 1.0 - 1.0 / np.asarray(paces, float)
+        self.blind, self.Q = observers.blind.astype(float), model.Q[model.x, model.x]
+        sets = manifolds(plant)
+        self.each = [Manifolds(*(a[sets.labels == label] for a in sets)) for label in observers.labels]
+
+    def start(self, n: int) -> Bank:
+        """All observers at rest, and nothing heard."""
+        plant, model, b, p, k = self.plant, self.model, self.b, self.p, len(self.keep)
+
         def zeros(*shape: int) -> Array:
             return np.zeros((n, *shape))
 
-        k = len(keep)
-        X, P = np.tile(plant.trim_state, (n, b, 1)), np.tile(model.P0[x, x], (n, b, 1, 1))
+        X, P = np.tile(plant.trim_state, (n, b, 1)), np.tile(model.P0[model.x, model.x], (n, b, 1, 1))
         return Bank(
-            X, P, zeros(n_x, p + q), zeros(b, k, p, p), zeros(b, k, p), zeros(b, k), zeros(b), zeros(b), zeros(m),
-            np.tile(model.R, (n, 1, 1)),
+            X, P, zeros(len(plant.states), p + self.q), zeros(b, k, p, p), zeros(b, k, p), zeros(b, k), zeros(b), zeros(b),
+            zeros(len(model.R)), np.tile(model.R, (n, 1, 1)),
         )  # fmt: skip
 
-    def around(s: Bank) -> Array:
+    def around(self, s: Bank) -> Array:
         """Where the model is linearised: the estimate of the observer whose residuals are smallest (n, n_x + q)."""
         best = np.argmin(s.energy[:, :, -1], axis=1)
-        return np.concatenate([s.X[np.arange(len(best)), best], np.zeros((len(best), q))], axis=1)
+        return np.concatenate([s.X[np.arange(len(best)), best], np.zeros((len(best), self.q))], axis=1)
 
-    def full(X: Array) -> Array:
+    def full(self, X: Array) -> Array:
         """States (n, b, n_x) as points of the augmented model."""
-        points = np.zeros((*X.shape[:2], N))
-        points[..., x] = X
+        points = np.zeros((*X.shape[:2], len(self.model.scale)))
+        points[..., self.model.x] = X
         return points
 
-    def predict(s: Bank, at: Interval) -> Bank:
-        f = about.f(around(s), at)
+    def predict(self, s: Bank, at: Interval) -> Bank:
+        """All observers over the interval, and the inputs' ways into the state."""
+        n_x, x = s.X.shape[2], self.model.x
+        f = self.about.f(self.around(s), at)
         A = f.A[:, None, :n_x, :n_x]
-        E = np.concatenate([f.E[:, :n_x], f.A[:, :n_x, n_x:]], axis=2) * inputs
-        P = symmetric(A @ s.P @ T(A)) + at.noise(Q).reshape(-1, 1, n_x, n_x)
-        return s._replace(X=model.f(full(s.X), at)[..., x], P=P, E=E)
+        E = np.concatenate([f.E[:, :n_x], f.A[:, :n_x, n_x:]], axis=2) * self.inputs
+        P = symmetric(A @ s.P @ T(A)) + at.noise(self.Q).reshape(-1, 1, n_x, n_x)
+        return s._replace(X=self.model.f(self.full(s.X), at)[..., x], P=P, E=E)
 
-    def update(s: Bank, at: Interval, y: Array, seen: Array) -> Bank:
-        n, y, seen = len(y), y[:, model.sensors], seen[:, model.sensors]
-        h = about.h(around(s), at)
-        C, H = h.A[..., :n_x], np.concatenate([h.E, np.zeros((n, m, q))], axis=2) * inputs
+    def update(self, s: Bank, at: Interval, y: Array, seen: Array) -> Bank:
+        """Correct all observers, and sum what speaks for each."""
+        model, size, keep, b, p, q = self.model, self.size, self.keep, self.b, self.p, self.q
+        n, n_x, m, y, seen = len(y), s.X.shape[2], len(model.R), y[:, model.sensors], seen[:, model.sensors]
+        h = self.about.h(self.around(s), at)
+        C, H = h.A[..., :n_x], np.concatenate([h.E, np.zeros((n, m, q))], axis=2) * self.inputs
         acted = (at.k > 0)[:, None, None]
         F = np.repeat(((C @ s.E + H) * acted)[:, None], b, axis=1)  # (n, b, m, c)
         cross = s.P @ T(C)[:, None]
-        nu = y[:, None] - model.h(full(s.X), at)
+        nu = y[:, None] - model.h(self.full(s.X), at)
         there = np.repeat(seen, b, axis=0)
         nu, S, cross, Ft = masked(
             there, nu.reshape(-1, m), (C[:, None] @ cross + model.R).reshape(-1, m, m), cross.reshape(-1, n_x, m),
             T(F).reshape(n * b, -1, m),
         )  # fmt: skip
-        own = np.tile(blind, (n, 1))[:, None]
+        own = np.tile(self.blind, (n, 1))[:, None]
         E, Ft = np.repeat(s.E * acted, b, axis=0) * own, Ft * T(own)
         weighed = solve(S, np.concatenate([T(Ft), T(cross), nu[..., None]], axis=2))
         SF, K, Snu = weighed[..., : p + q], T(weighed[..., p + q : -1]), weighed[..., -1]
@@ -219,12 +227,13 @@ def bank_filter(plant: Plant, model: AugmentedModel, size: Array, observers: Obs
             nu.reshape(n, b, m)[:, 0], (S + T(Ft) @ Ft).reshape(n, b, m, m)[:, 0],
         )  # fmt: skip
 
-    def read(s: Bank) -> Reading:
-        n, k = len(s.X), len(keep)
+    def read(self, s: Bank) -> Reading:
+        """The label whose observer's residuals are smallest for what it may explain."""
+        n, k, p, observers, labels = len(s.X), len(self.keep), self.p, self.observers, len(self.plant.labels)
         cost, z = np.full((n, labels), NEVER), np.zeros((n, labels, p))
         healthy = s.energy[:, 0]
         cost[:, 0] = 0.0
-        for i, (label, set_) in enumerate(zip(observers.labels, each, strict=True)):
+        for i, (label, set_) in enumerate(zip(observers.labels, self.each, strict=True)):
             if label == 0:
                 continue
             value, magnitude = nearest_of(s.G[:, i].reshape(-1, p, p), s.g[:, i].reshape(-1, p), set_)
@@ -237,7 +246,15 @@ def bank_filter(plant: Plant, model: AugmentedModel, size: Array, observers: Obs
         shown = {"residuals": s.r, "degrees of freedom": s.freedoms}
         return Reading(z[np.arange(n), best], x=s.X[np.arange(n), own], nu=s.nu, S=s.S, cost=cost, signals=shown)
 
-    return Filter(start, predict, update, read, expect=lambda s, at: model.expect(around(s)[:, :n_x], at))
+
+def bank_filter(plant: Plant, model: AugmentedModel, size: Array, observers: Observers, paces: Sequence[float]) -> Filter:
+    """The bank; arguments as in `_Functions`."""
+    f = _Functions(plant, model, size, observers, paces)
+
+    def expect(s: Bank, at: Interval) -> Array:
+        return model.expect(f.around(s)[:, : s.X.shape[2]], at)
+
+    return Filter(f.start, f.predict, f.update, f.read, expect=expect)
 
 
 @diagnoser("unknown_input_observers", "Bank of unknown-input observers, one blind to each label's faults, for any plant")

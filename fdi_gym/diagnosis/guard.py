@@ -68,6 +68,28 @@ def _copied(name: str, given: Any, shape: tuple[int, ...], kinds: str) -> Array:
     return value if value.dtype == dtype else value.astype(dtype)
 
 
+def _singly(raw: Diagnoser, state: Any, obs: Array) -> tuple[Any, Diagnosis, Array]:
+    """The update, episode by episode, after it failed for the batch; and which failed."""
+    n = len(obs)
+    failed, states, answers = np.zeros(n, bool), [], []
+    for i in range(n):
+        part = map_arrays(lambda a, i=i: a[i : i + 1], state)
+        try:
+            part, answer = raw.update(part, obs[i : i + 1])
+        except (np.linalg.LinAlgError, FloatingPointError):
+            failed[i], answer = True, None
+        states.append(part)
+        answers.append(answer)
+    template = next((a for a in answers if a is not None), Diagnosis(np.zeros(1, bool), np.zeros(1, np.int64)))
+    answers = [template if a is None else a for a in answers]
+    leader = int(np.argmin(failed))
+    states[0], states[leader] = states[leader], states[0]  # shared counters are those of one that went on
+    order = np.arange(n)
+    order[0], order[leader] = leader, 0
+    joined = map_arrays(lambda *parts: np.concatenate(parts)[order], *states)
+    return joined, map_arrays(lambda *parts: np.concatenate(parts), *answers), failed
+
+
 def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
     """The diagnoser as the evaluation runs it.
 
@@ -91,27 +113,6 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
         healthy = Diagnosis(np.zeros(n, bool), np.zeros(n, np.int64), estimate, np.full_like(estimate, np.nan))
         return raw.init(n) if n else None, healthy, np.zeros((n, width)), np.zeros(n, bool)
 
-    def singly(state: Any, obs: Array) -> tuple[Any, Diagnosis, Array]:
-        """The update, episode by episode, after it failed for the batch; and which failed."""
-        n = len(obs)
-        failed, states, answers = np.zeros(n, bool), [], []
-        for i in range(n):
-            part = map_arrays(lambda a, i=i: a[i : i + 1], state)
-            try:
-                part, answer = raw.update(part, obs[i : i + 1])
-            except (np.linalg.LinAlgError, FloatingPointError):
-                failed[i], answer = True, None
-            states.append(part)
-            answers.append(answer)
-        template = next((a for a in answers if a is not None), Diagnosis(np.zeros(1, bool), np.zeros(1, np.int64)))
-        answers = [template if a is None else a for a in answers]
-        leader = int(np.argmin(failed))
-        states[0], states[leader] = states[leader], states[0]  # shared counters are those of one that went on
-        order = np.arange(n)
-        order[0], order[leader] = leader, 0
-        joined = map_arrays(lambda *parts: np.concatenate(parts)[order], *states)
-        return joined, map_arrays(lambda *parts: np.concatenate(parts), *answers), failed
-
     def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
         inner, last, last_obs, lost = state
         n = len(lost)
@@ -133,7 +134,7 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
                 after, answer = raw.update(inner, obs)
                 failed = None
             except np.linalg.LinAlgError:
-                after, answer, failed = singly(inner, obs)
+                after, answer, failed = _singly(raw, inner, obs)
         answer, wrong, bad = examined(n, answer)
         if failed is not None:
             wrong, bad = wrong | failed, True
