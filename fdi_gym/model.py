@@ -93,12 +93,13 @@ class Model:
         """
         from fdi_gym import integration, kernels
 
-        if self.kernels is None:
+        own = self.kernels
+        if own is None:
             raise NotApplicableError("needs equations; this plant declares channels only")
 
-        given = {role: f or getattr(kernels, role, None) for role, f in self.kernels._asdict().items()}
-        given["interval"] = integration.interval(given["dynamics"], given["project"])
-        return Addresses(*(kernels.address(given[role]) for role in Addresses._fields))
+        interval = integration.interval(own.dynamics, own.project or kernels.project)
+        others = (getattr(own, role) or getattr(kernels, role) for role in Addresses._fields[1:])
+        return Addresses(*map(kernels.address, (interval, *others)))
 
     @functools.cached_property
     def tangent(self) -> int:

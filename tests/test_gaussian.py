@@ -459,11 +459,13 @@ def test_any_array_will_do():
 
 def test_a_copied_model_finds_the_compiled_code_again():
     """What is pickled holds no address; whoever unpickles it asks the plant for its own."""
-    case = Case("MissilePitch")
-    assert not case.model.__reduce__()[1][2][0][:2].any()
+    case = Case("MissilePitch", derivatives=True)
+    assert case.model.constants[0][:3].all()
+    assert not case.model.__reduce__()[1][2][0][:3].any()
     again = copy.copy(case.model)
-    for a, b in zip(case.predict("unscented", model=again), case.predict("unscented"), strict=True):
-        assert np.array_equal(a, b)
+    for rule in ("unscented", "extended"):
+        for a, b in zip(case.predict(rule, model=again), case.predict(rule), strict=True):
+            assert np.array_equal(a, b)
 
 
 def test_an_empty_batch_is_one():

@@ -106,7 +106,8 @@ def jacobian_f(model: Model, X: Array, t: Array, u: Array, d: Array | None = Non
 
     It is exact where the plant says its derivatives; elsewhere central differences take its place.
     """
-    if model.constants[0][TANGENT] and X.shape[1:] == model.step.shape:
+    _check_width(model, X)
+    if model.constants[0][TANGENT]:
         X1, F = np.empty(X.shape), np.empty((*X.shape, X.shape[1]))
         _call(kernels.differentiate, model.constants, X, t, u, model.unmeasured if d is None else d, X1, F)
         return X1, F
@@ -115,13 +116,17 @@ def jacobian_f(model: Model, X: Array, t: Array, u: Array, d: Array | None = Non
 
 def jacobian_h(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> tuple[Array, Array]:
     """What the sensors read at X (n, N) at t (n,) [s]: (n, m), and its Jacobian (n, m, N) by central differences."""
+    _check_width(model, X)
     return _differences(model, h(model, _along_axes(model, X), t, u, d))
+
+
+def _check_width(model: Model, X: Array) -> None:
+    if X.ndim != 2 or X.shape[1] != len(model.step):
+        raise ValueError(f"X needs the shape (n, {len(model.step)}), not {X.shape}")
 
 
 def _along_axes(model: Model, X: Array) -> Array:
     """X (n, N), and X plus and minus the step of each entry: (n, 2 N + 1, N)."""
-    if X.ndim != 2 or X.shape[1] != len(model.step):
-        raise ValueError(f"X needs the shape (n, {len(model.step)}), not {X.shape}")
     step = np.diag(model.step)
     return X[:, None] + np.concatenate([np.zeros_like(step[:1]), step, -step])
 

@@ -34,6 +34,7 @@ from fdi_gym.estimation.gaussian_points import (
     factor,
     moments_of_points,
     pass_points,
+    put_magnitudes,
     spread,
     squared_step,
 )
@@ -140,13 +141,11 @@ def differentiated(integers, reals, step, offset, direction, t, X, u, known, F, 
     n, n_theta, own, n_D = integers[STATES], integers[THETA], integers[OWN], integers[KNOWN]
     p, n_d, n_m, N = integers[ENTRIES], integers[DISTURBANCES], direction.shape[1], step.size
     now, d = reals[1:].copy(), known.copy()
+    put_magnitudes(integers, offset, direction, X, reals[1:], now)
     n_p = now.size - n_theta
     L, used, count = np.zeros((own + n_D + n_p, N)), np.empty(p + n_d, np.int64), 0
     for e in range(p):
-        i, deviation = integers[SIZES + e], offset[e]
-        for j in range(n_m):
-            deviation += direction[e, j] * X[n + j]
-        now[i] += deviation
+        i = integers[SIZES + e]
         if i < own or i >= n_theta:  # else it is a fault of a sensor
             used[count] = i if i < own else own + n_D + i - n_theta
             for j in range(n_m):

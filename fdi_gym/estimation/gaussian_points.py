@@ -13,9 +13,19 @@ from fdi_gym.kernels import helper, map_at
 EXTENDED, UNSCENTED, CENTRAL_DIFFERENCE = 0, 1, 2
 JITTER, RETRIES = 1e-14, 7  # added to the diagonal where the factorisation fails, times 100 at each retry
 # The integers of a model: three addresses (the third may be 0), sizes, then the lists (entries, disturbances, sensors)
-INTERVAL, OUTPUT, TANGENT, SUBSTEPS, STATES, OUTPUTS, THETA, KNOWN, ENTRIES, DISTURBANCES, SENSORS, OWN, COMMANDS, SIZES = (
-    range(14)
-)
+INTERVAL, OUTPUT, TANGENT = range(3)
+SUBSTEPS, STATES, OUTPUTS, THETA, KNOWN, ENTRIES, DISTURBANCES, SENSORS, OWN, COMMANDS, SIZES = range(3, 14)
+
+
+@helper
+def put_magnitudes(integers, offset, direction, X, nominal, now):
+    """theta and the physical parameters at the magnitudes in X: nominal, but for the entries on the line."""
+    n_x = integers[STATES]
+    for e in range(integers[ENTRIES]):
+        i, deviation = integers[SIZES + e], offset[e]
+        for j in range(direction.shape[1]):
+            deviation += direction[e, j] * X[n_x + j]
+        now[i] = nominal[i] + deviation
 
 
 @helper
@@ -28,8 +38,7 @@ def pass_points(moving, integers, reals, offset, direction, t, points, u, known,
     substeps, n_x, n_y, n_theta = integers[SUBSTEPS], integers[STATES], integers[OUTPUTS], integers[THETA]
     p, n_d, m, own = integers[ENTRIES], integers[DISTURBANCES], integers[SENSORS], integers[OWN]
     n_m = direction.shape[1]
-    entries, rest = integers[SIZES : SIZES + p], integers[SIZES + p :]
-    disturbances, sensors = rest[:n_d], rest[n_d:]
+    disturbances, sensors = integers[SIZES + p : SIZES + p + n_d], integers[SIZES + p + n_d :]
     dt, nominal = reals[0], reals[1:]
     now = nominal.copy()
     theta, physical = now[:n_theta], now[n_theta:]
@@ -42,11 +51,7 @@ def pass_points(moving, integers, reals, offset, direction, t, points, u, known,
         for j in range(n_x, n_x + n_m):
             moved = moved or points[i, j] != points[i - 1, j]
         if moved:  # the magnitudes, of which most points have those of the one before
-            for e in range(p):
-                deviation = offset[e]
-                for j in range(n_m):
-                    deviation += direction[e, j] * points[i, n_x + j]
-                now[entries[e]] = nominal[entries[e]] + deviation
+            put_magnitudes(integers, offset, direction, points[i], nominal, now)
         for j in range(n_d):
             d[disturbances[j]] = points[i, n_x + n_m + j]
         for j in range(n_x):

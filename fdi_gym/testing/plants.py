@@ -44,6 +44,8 @@ def check_plant(plant: Plant, seeds: Sequence[int] = range(5)) -> None:
             assert again == scenario, f"{name}: a scenario does not survive JSON"
         record = simulate(plant, scenarios)
         _check_record(plant, name, scenarios, record)
+        if name == "standard" and plant.kernels is not None and plant.kernels.jacobian is not None:
+            _check_jacobian(plant, plant.kernels, record)
         replay = simulate(plant, [FaultScenario.from_json(s.to_json()) for s in scenarios])
         for said, found, again in zip(Record._fields, record, replay, strict=True):
             assert np.array_equal(found, again), f"{name}: a replayed flight differs in {said}"
@@ -55,8 +57,6 @@ def check_plant(plant: Plant, seeds: Sequence[int] = range(5)) -> None:
     _check_model(plant, draw(standard, seeds[0]))
     if plant.linear:
         _check_linear(plant)
-    if plant.kernels is not None and plant.kernels.jacobian is not None:
-        _check_jacobian(plant, plant.kernels, simulate(plant, [draw(standard, seed) for seed in seeds]))
 
 
 def _check_range(what: str, signals: Sequence[Signal], values: Array) -> None:
@@ -73,9 +73,13 @@ def _check_range(what: str, signals: Sequence[Signal], values: Array) -> None:
 def _check_bounds(plant: Plant, record: Record) -> None:
     """The kernels stay within their arrays at some samples of each flight."""
     _, u, _ = plant.split(record.obs)
-    for i, last in enumerate(record.length.tolist()):
-        for k in range(0, last + 1, max(last // 8, 1)):
-            check_bounds_at(plant, k * plant.dt, record.state[i, k], u[i, k], record.theta[i, k])
+    for i, k in _some(record):
+        check_bounds_at(plant, k * plant.dt, record.state[i, k], u[i, k], record.theta[i, k])
+
+
+def _some(record: Record) -> list[tuple[int, int]]:
+    """Flights and samples: some of each flight, over its length."""
+    return [(i, k) for i, last in enumerate(record.length.tolist()) for k in range(0, last + 1, max(last // 8, 1))]
 
 
 def _check_record(plant: Plant, name: str, scenarios: Sequence[FaultScenario], record: Record) -> None:
@@ -183,8 +187,7 @@ def _check_jacobian(plant: Plant, kernels: Kernels, record: Record) -> None:
         np.maximum(np.abs(plant.nominal_p), 1e-3).tolist(),
     ]  # fmt: skip
     _, u, _ = plant.split(record.obs)
-    samples = [(i, k) for i, last in enumerate(record.length.tolist()) for k in range(1, last + 1, max(last // 8, 1))]
-    for i, k in samples:
+    for i, k in _some(record):
         t, command = k * plant.dt, contiguous(u[i, k])
         at = [record.state[i, k], record.theta[i, k, : len(own)], np.zeros(len(sizes[2])), plant.nominal_p]
         at = [contiguous(value) for value in at]
