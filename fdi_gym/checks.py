@@ -215,8 +215,11 @@ def _wrong_probe(plant: Plant, probe: Probe) -> Iterable[str]:
 # Scenarios
 
 
-def check_scenario(plant: Plant, scenario: FaultScenario) -> None:
-    """Raise ValueError where a scenario does not fit its plant; the message names the field and what is allowed."""
+def check_scenario(plant: Plant, scenario: FaultScenario) -> list[tuple[int, int]]:
+    """Raise ValueError where a scenario does not fit its plant; the message names the field and what is allowed.
+
+    Returns the changes of its true label (see `Truth.label_changes`).
+    """
     if not isinstance(scenario, FaultScenario):
         raise TypeError(f"a scenario is a FaultScenario, not {type(scenario).__name__}")
     scenario = scenario.replace()  # its own checks once more: lists can be written to
@@ -233,11 +236,12 @@ def check_scenario(plant: Plant, scenario: FaultScenario) -> None:
             _check_effect(plant, f"faults[{i}]", effect, scenario.steps)
     if isinstance(scenario.sampling, Sampling):
         check_sampling(plant, scenario.sampling, scenario.steps)
-    plant.label_changes(scenario)  # there is a label for each set of modes that are active at once
+    changes = plant.label_changes(scenario)  # there is a label for each set of modes that are active at once
     for name in ("reference", "disturbance", "physical"):
         shape = getattr(plant.shapes, name)
         if shape is not None:
             shapes.check(f"{name} of a {plant.id} scenario", getattr(scenario, name), shape)
+    return changes
 
 
 def _check_state(plant: Plant, x0: Sequence[float]) -> None:

@@ -192,7 +192,7 @@ def fly(
     course, theta_k = np.empty((3, n_theta)), np.empty(n_theta)
     a, b, g, theta_p, acts_p = course[0], course[1], course[2], theta_k[:own], acts[:own]  # the last two: the plant's own
     r, d = np.empty(n_r), np.empty(n_d)
-    work, before = np.empty((5, n)), np.empty(n)
+    before = np.empty(n)
     used, words, normals = sigma > 0.0, np.empty((2, TILE), np.uint64), np.zeros((TILE, sigma.size))
     steady = not used.any()
     for tile in range(0, samples, TILE):
@@ -281,7 +281,7 @@ def fly(
                     drifts = _effects(k, False, dt, acting, count, values_i, held_i, nominal, a, b, g)
                 for i in range(n):
                     before[i] = x[i]
-                interval(t, dt, substeps, drifts, x, u, course, d, p_i, acts_p, work)
+                interval(t, dt, substeps, drifts, x, u, course, d, p_i, acts_p)
                 for j in range(own, n_theta):
                     acts[j] = a[j] + (b[j] * (dt if g[j] < 0.0 else np.exp(-g[j] * dt)) if b[j] else 0.0)
                 lost = False

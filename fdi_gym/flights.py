@@ -148,9 +148,9 @@ class Flights:
         Raises:
             ValueError: A scenario that the plant refuses, or noise of another shape.
         """
-        self.plant.validate(scenario)
+        labels = self.plant.validate(scenario)
         given = (None, None) if noise is None else self._checked_noise(noise, scenario.steps)
-        return Prepared(scenario, self.plant.inputs(scenario), self.plant.label_changes(scenario), given)
+        return Prepared(scenario, self.plant.inputs(scenario), labels, given)
 
     def put(self, slots: Iterable[int], made: Sequence[Prepared]) -> None:
         """Begin prepared flights in these slots; the others go on."""

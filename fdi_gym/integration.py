@@ -1,4 +1,4 @@
-"""One sample interval of any plant, and the model's prediction and output for many points at once."""
+"""One sample interval of any plant, the model's prediction and output for many points at once, and lags of first order."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numba import boolean, float64, int64, void
 
-from fdi_gym.kernels import M, V, around, compiled, function_at, map_at
+from fdi_gym.kernels import M, V, around, compiled, function_at, map_at, stack
 
 
 @numba.njit
@@ -18,56 +18,64 @@ def _theta_at(tau, a, b, g, theta):
             theta[j] = a[j] + b[j] * (tau if g[j] < 0.0 else np.exp(-g[j] * tau))
 
 
-def _around(dynamics: Any, project: Any) -> Any:
-    def interval(t, dt, substeps, drifts, x, u, course, d, p, theta, work):
+def _around(sizes: tuple[int, ...], dynamics: Any, project: Any) -> Any:
+    n, n_theta = sizes
+    of_state, of_theta = stack(n), stack(n_theta)  # known sizes: LLVM unrolls the loops and keeps all in registers
+
+    def interval(t, dt, substeps, drifts, x, u, course, d, p, theta):
         a, b, g = course[0], course[1], course[2]
-        k1, k2, k3, k4, z = work[0], work[1], work[2], work[3], work[4]
-        n = x.size
-        _theta_at(0.0, a, b, g, theta)
+        k1, k2, k3, k4, z, now, acts = of_state(), of_state(), of_state(), of_state(), of_state(), of_state(), of_theta()
+        for i in range(n):
+            now[i] = x[i]
+        _theta_at(0.0, a, b, g, acts)
         if substeps == 0:
-            dynamics(t, x, u, theta, d, p, k1)
+            dynamics(t, now, u, acts, d, p, k1)
             for i in range(n):
-                x[i] = k1[i]
+                now[i] = k1[i]
         else:
             h = dt / substeps
             for s in range(substeps):
                 tau = s * h
-                dynamics(t + tau, x, u, theta, d, p, k1)
+                dynamics(t + tau, now, u, acts, d, p, k1)
                 for i in range(n):
-                    z[i] = x[i] + 0.5 * h * k1[i]
+                    z[i] = now[i] + 0.5 * h * k1[i]
                 if drifts:
-                    _theta_at(tau + 0.5 * h, a, b, g, theta)
-                dynamics(t + tau + 0.5 * h, z, u, theta, d, p, k2)
+                    _theta_at(tau + 0.5 * h, a, b, g, acts)
+                dynamics(t + tau + 0.5 * h, z, u, acts, d, p, k2)
                 for i in range(n):
-                    z[i] = x[i] + 0.5 * h * k2[i]
-                dynamics(t + tau + 0.5 * h, z, u, theta, d, p, k3)
+                    z[i] = now[i] + 0.5 * h * k2[i]
+                dynamics(t + tau + 0.5 * h, z, u, acts, d, p, k3)
                 for i in range(n):
-                    z[i] = x[i] + h * k3[i]
+                    z[i] = now[i] + h * k3[i]
                 if drifts:
-                    _theta_at(tau + h, a, b, g, theta)
-                dynamics(t + tau + h, z, u, theta, d, p, k4)
+                    _theta_at(tau + h, a, b, g, acts)
+                dynamics(t + tau + h, z, u, acts, d, p, k4)
                 for i in range(n):
-                    x[i] += h / 6.0 * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i])
+                    now[i] += h / 6.0 * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i])
         if drifts:
-            _theta_at(dt, a, b, g, theta)
-        project(x, theta)
+            _theta_at(dt, a, b, g, acts)
+        project(now, acts)
+        for i in range(n):
+            x[i] = now[i]
+        for j in range(n_theta):
+            theta[j] = acts[j]
 
     return interval
 
 
-_INTERVAL = void(float64, float64, int64, boolean, V, V, M, V, V, V, M)
+_INTERVAL = void(float64, float64, int64, boolean, V, V, M, V, V, V)
 interval_at = function_at(_INTERVAL)
 
 
-def interval(dynamics: Any, project: Any) -> Any:
+def interval(states: int, entries: int, dynamics: Any, project: Any) -> Any:
     """The kernel of one sample interval of a plant, compiled around its own; call it by address, with `interval_at`.
 
-    Its arguments: t, dt, substeps, drifts, x, u, course, d, p, theta, work (5, n_x), the last two for it to use. It moves x
-    on to t + dt with theta(t + tau) = a + b exp(-g tau), or a + b tau where g < 0, of the course (a, b, g); u and d are
-    held. Classical Runge-Kutta with `substeps` steps; for 0 the plant is discrete and maps x itself. `drifts` says whether
-    any b is not 0.
+    It is for so many states and entries of theta. Its arguments: t, dt, substeps, drifts, x, u, course, d, p, theta. It
+    moves x on to t + dt with theta(t + tau) = a + b exp(-g tau), or a + b tau where g < 0, of the course (a, b, g), and
+    gives theta as it is then; u and d are held. Classical Runge-Kutta with `substeps` steps; for 0 the plant is discrete
+    and maps x itself. `drifts` says whether any b is not 0.
     """
-    return around(_around, _INTERVAL, dynamics, project)
+    return around(_around, _INTERVAL, dynamics, project, sizes=(states, entries))
 
 
 @compiled(void(int64, float64, int64, V, M, M, M, M, M, M))
@@ -76,7 +84,7 @@ def propagate(interval_address, dt, substeps, t, x, u, theta, d, p, out):
     interval = interval_at(interval_address)
     points, n = x.shape
     xi, ui, di, pi = np.empty(n), np.empty(u.shape[1]), np.empty(d.shape[1]), np.empty(p.shape[1])
-    course, theta_now, work = np.zeros((3, theta.shape[1])), np.empty(theta.shape[1]), np.empty((5, n))
+    course, theta_now = np.zeros((3, theta.shape[1])), np.empty(theta.shape[1])
     every_t, every_u, every_theta = points // t.size, points // u.shape[0], points // theta.shape[0]
     every_d, every_p = points // d.shape[0], points // p.shape[0]
     for i in range(points):
@@ -90,7 +98,7 @@ def propagate(interval_address, dt, substeps, t, x, u, theta, d, p, out):
             di[j] = d[i // every_d, j]
         for j in range(pi.size):
             pi[j] = p[i // every_p, j]
-        interval(t[i // every_t], dt, substeps, False, xi, ui, course, di, pi, theta_now, work)
+        interval(t[i // every_t], dt, substeps, False, xi, ui, course, di, pi, theta_now)
         for j in range(n):
             out[i, j] = xi[j]
 
@@ -118,3 +126,16 @@ def evaluate(function_address, t, x, u, theta, d, p, out):
         function(t[i // every_t], xi, ui, ti, di, pi, oi)
         for j in range(oi.size):
             out[i, j] = oi[j]
+
+
+@compiled(void(float64, V))
+def _first_order(a, course):
+    for k in range(1, course.size):
+        course[k] += a * course[k - 1]
+
+
+def first_order(a: float, inputs: np.ndarray) -> np.ndarray:
+    """The course s (K,) of a discrete first-order lag: s_0 = e_0, s_k = a s_{k-1} + e_k, of its inputs e (K,)."""
+    course = np.array(inputs, float)
+    _first_order(a, course)
+    return course

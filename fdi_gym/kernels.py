@@ -14,10 +14,10 @@ role a function has, and the role fixes its compiled signature:
 
 with t the time [s], x the state, theta the fault parameter, d the disturbance, p the physical parameters, r the row
 of exogenous references, q the controller's parameters. A function with any other parameters is a helper that the
-file's kernels may call. A kernel must not call a kernel of another file, which is what keeps numba's disk cache valid:
-the generic kernels (`closed_loop.py`, the filters') get the addresses of the plant's compiled functions (`address`) and
-call through them. So they are compiled once for all plants. What is called most, a sample interval of `integration.py`,
-is compiled anew around each plant's equations (`around`).
+file's kernels may call, as they may `sincos` of `trigonometry.py`. A kernel must not call a kernel of another plant,
+which is what keeps numba's disk cache valid: the generic kernels (`closed_loop.py`, the filters') get the addresses of the
+plant's compiled functions (`address`) and call through them. So they are compiled once for all plants. What is called most,
+a sample interval of `integration.py`, is compiled anew around each plant's equations (`around`).
 
 `kernel_cache.py` says where the compiled code is kept.
 """
@@ -34,6 +34,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+from llvmlite import ir
 from numba import boolean, float64, int64, types, void
 from numba.core import cgutils, config
 from numba.extending import intrinsic
@@ -59,6 +60,7 @@ _ROLES = {
 }
 
 
+_carray: Any = numba.carray  # type: ignore[attr-defined]  # the array at a pointer
 njit: Any = numba.njit  # what only kernels call needs no way in from Python or C, slow to compile: `helper`
 helper = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
@@ -134,12 +136,34 @@ def compiled(signature: Any) -> Callable[[Any], Any]:
 
 
 @functools.cache
-def around(make: Callable[..., Any], signature: Any, *kernels: Any) -> Any:
-    """The function that `make` writes around a plant's kernels, compiled with them inside it; cached with the first one."""
+def around(make: Callable[..., Any], signature: Any, *kernels: Any, sizes: tuple[int, ...] = ()) -> Any:
+    """The function that `make` writes around a plant's kernels, compiled with them inside it; cached with the first one.
+
+    `sizes`, if any, come first in what `make` gets; it may compile them in.
+    """
     inner = njit(error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-    function = make(*(inner(k.py_func) for k in kernels))
-    function.__qualname__ = f"{function.__name__}_{name_around(make, *kernels)}"
+    function = make(*((sizes,) if sizes else ()), *(inner(k.py_func) for k in kernels))
+    function.__qualname__ = "_".join([function.__name__, *map(str, sizes), name_around(make, *kernels)])
     return _lazily(function, signature, kernels)
+
+
+def stack(size: int) -> Any:
+    """A function that gives an array (size,) of float64 on the stack, uninitialised; it lives as long as its caller."""
+
+    def _room_at(typing_context):
+        def codegen(context, builder, signature, arguments):
+            room = cgutils.alloca_once(builder, ir.ArrayType(ir.DoubleType(), size))
+            return builder.bitcast(room, context.get_value_type(signature.return_type))
+
+        return types.CPointer(float64)(), codegen
+
+    _room: Any = intrinsic(_room_at)
+
+    @njit(error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    def array():
+        return _carray(_room(), size)
+
+    return array
 
 
 class Sent:

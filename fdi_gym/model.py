@@ -97,7 +97,7 @@ class Model:
         if own is None:
             raise NotApplicableError("needs equations; this plant declares channels only")
 
-        interval = integration.interval(own.dynamics, own.project or kernels.project)
+        interval = integration.interval(len(self.states), self.own_theta, own.dynamics, own.project or kernels.project)
         others = (getattr(own, role) or getattr(kernels, role) for role in Addresses._fields[1:])
         return Addresses(*map(kernels.address, (interval, *others)))
 

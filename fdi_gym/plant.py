@@ -286,14 +286,17 @@ class Plant(Truth):
         """Names of the fault modes, in order."""
         return tuple(mode.name for mode in self.modes)
 
-    def validate(self, scenario: FaultScenario) -> None:
+    def validate(self, scenario: FaultScenario) -> list[tuple[int, int]]:
         """Whether a scenario fits this plant, whole: every flight asks before a kernel sees it.
+
+        Returns:
+            The changes of its true label, as `label_changes` gives them.
 
         Raises:
             ValueError: It does not; the message names the field, what was wrong and what is allowed.
             TypeError: It is no scenario.
         """
-        check_scenario(self, scenario)
+        return check_scenario(self, scenario)
 
     def process(self, name: str) -> FaultProcess:
         """A fault process by name.

@@ -27,6 +27,7 @@ from fdi_gym.faults import (
 )
 from fdi_gym.plants import b747_lateral as b747
 from fdi_gym.theta import theta_table
+from fdi_gym.trigonometry import sincos
 
 MOTOR = {"reference": {"levels": [100.0]}, "disturbance": {"load": 0.02}}
 
@@ -247,6 +248,19 @@ def test_registered_plant_has_its_environment(motor):
     obs, _ = env.reset(seed=0)
     assert obs.shape == (3,)
     assert motor.env_id == dc_motor.ENV == "DCMotor-Faults-v0"  # what registering it returned
+
+
+def test_sines_and_cosines_are_right_to_less_than_two_rounding_units():
+    rng = np.random.default_rng(0)
+    x = np.concatenate([
+        rng.uniform(-7, 7, 20_000), rng.uniform(-1e5, 1e5, 20_000), 10.0 ** rng.uniform(-300, 0, 2000),
+        np.arange(-4000, 4001) * (np.pi / 4), rng.uniform(-1, 1, 2000) * 10.0 ** rng.uniform(5, 300, 2000), [0.0, -0.0],
+    ])  # fmt: skip
+    found = np.array([sincos(value) for value in x.tolist()]).T
+    exact = np.array([np.sin(x.astype(np.longdouble)), np.cos(x.astype(np.longdouble))])
+    assert np.abs(found - exact).max() < 1.6e-16
+    assert (np.abs(found) <= 1.0).all()
+    assert np.isnan([sincos(value) for value in (np.nan, np.inf, -np.inf)]).all()
 
 
 def test_small_solves_are_lapacks():

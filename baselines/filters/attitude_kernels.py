@@ -27,7 +27,7 @@ def predict(interval_address, dt, substeps, physical, X, P, sign, u, Q, X1, P1, 
     interval = interval_at(interval_address)
     (n, N), n_theta = X.shape, u.shape[1]
     n_x = N - n_theta + 1
-    x, course, theta_now, d, work = np.empty(n_x), np.zeros((3, n_theta)), np.empty(n_theta), np.zeros(0), np.empty((5, n_x))
+    x, course, theta_now, d = np.empty(n_x), np.zeros((3, n_theta)), np.empty(n_theta), np.zeros(0)
     U, points, values, first = np.empty((N, N)), np.empty((2 * N + 1, N)), np.empty((2 * N + 1, N)), np.empty((N, N))
     mean, cross, cov = np.empty(N), np.empty((N, N)), np.empty((N, N))
     for e in range(n):
@@ -37,7 +37,7 @@ def predict(interval_address, dt, substeps, physical, X, P, sign, u, Q, X1, P1, 
             put_back(points[i, : n_x - 1], sign[e], x)
             for j in range(n_theta):
                 course[0, j] = values[i, n_x - 1 + j] = points[i, n_x - 1 + j]
-            interval(0.0, dt, substeps, False, x, u[e], course, d, physical, theta_now, work)
+            interval(0.0, dt, substeps, False, x, u[e], course, d, physical, theta_now)
             if i == 0:
                 sign1[e] = -1.0 if x[3] < 0.0 else 1.0
             for j in range(n_x - 1):

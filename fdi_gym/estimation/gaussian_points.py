@@ -45,7 +45,6 @@ def pass_points(moving, integers, reals, offset, direction, t, points, u, known,
     x, y, theta_now, course = np.empty(n_x), np.empty(n_y), np.empty(own), np.zeros((3, own))
     theta_p = theta[:own]  # the rest are faults of the sensors
     d = known.copy()
-    work = np.empty((5, n_x))
     for i in range(points.shape[0]):
         moved = i == 0
         for j in range(n_x, n_x + n_m):
@@ -59,7 +58,7 @@ def pass_points(moving, integers, reals, offset, direction, t, points, u, known,
         if moving:
             for j in range(own):
                 course[0, j] = theta[j]
-            interval(t, dt, substeps, False, x, u, course, d, physical, theta_now, work)
+            interval(t, dt, substeps, False, x, u, course, d, physical, theta_now)
             for j in range(n_x):
                 values[i, j] = x[j]
         else:

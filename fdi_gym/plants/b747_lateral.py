@@ -37,7 +37,6 @@ Version history: v0, the first.
 from __future__ import annotations
 
 import functools
-import itertools
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -49,6 +48,7 @@ from msgspec import UNSET, Meta, UnsetType
 from fdi_gym.acting import Acting, Probe, square
 from fdi_gym.drawing import uniform
 from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Hold, Scoring
+from fdi_gym.integration import first_order
 from fdi_gym.kernels import kernel
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
 from fdi_gym.shapes import Shapes, only_with, together
@@ -238,8 +238,7 @@ def reference_rows(scenario: FaultScenario) -> np.ndarray:
     levels = scenario.reference.get("bank_levels", [0.0])
     if any(levels):
         a, last = float(np.exp(-DT / 2.0)), len(levels) - 1
-        inputs = ((1 - a) * levels[min(k // 150, last)] for k in range(steps + 1))
-        rows[:, 2] = list(itertools.accumulate(inputs, lambda s, e: a * s + e, initial=0.0))[1:]
+        rows[:, 2] = first_order(a, (1 - a) * np.array(levels)[np.minimum(np.arange(steps + 1) // 150, last)])
     return rows
 
 

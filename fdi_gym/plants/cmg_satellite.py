@@ -68,6 +68,7 @@ from fdi_gym.kernels import M, V, compiled, kernel
 from fdi_gym.model import contiguous
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
 from fdi_gym.shapes import Nothing, Shapes
+from fdi_gym.trigonometry import sincos
 
 ID = "CMGSatellite"
 VERSION = 0
@@ -102,10 +103,8 @@ TABLE_4 = ((0, 0.5, 2000, 4000), (1, 0.1, 4000, 7000), (2, 0.1, 7000, 10000), (3
 # Equations. Vectors are written out in components: numba then needs no memory, and NumPy takes arrays as components.
 
 
-def pyramid(d1, d2, d3, d4):
+def cluster_rows(s1, s2, s3, s4, c1, c2, c3, c4):
     """A(d) = sum dE/dd and E(d), each as three rows of four: hdot = h0 A r, h = h0 E (1, 1, 1, 1)'."""
-    c1, c2, c3, c4 = np.cos(d1), np.cos(d2), np.cos(d3), np.cos(d4)
-    s1, s2, s3, s4 = np.sin(d1), np.sin(d2), np.sin(d3), np.sin(d4)
     A = (
         (-CB * c1, s2, CB * c3, -s4),
         (-s1, -CB * c2, s3, CB * c4),
@@ -119,7 +118,18 @@ def pyramid(d1, d2, d3, d4):
     return A, E
 
 
-_pyramid = kernel(pyramid)
+_cluster_rows = kernel(cluster_rows)
+
+
+def pyramid(d1, d2, d3, d4):
+    """A(d) and E(d) of gimbal angles in numbers or arrays."""
+    return cluster_rows(*(f(d) for f in (np.sin, np.cos) for d in (d1, d2, d3, d4)))
+
+
+@kernel
+def _pyramid(d1, d2, d3, d4):
+    (s1, c1), (s2, c2), (s3, c3), (s4, c4) = sincos(d1), sincos(d2), sincos(d3), sincos(d4)
+    return _cluster_rows(s1, s2, s3, s4, c1, c2, c3, c4)
 
 
 @kernel
@@ -337,9 +347,8 @@ def control(t, y, r, q, c, u):
     m11, m12, m13, m22, m23, m33 = gram(A)
     _, _, _, det = solve3(m11, m12, m13, m22, m23, m33, 0.0, 0.0, 0.0)
     lam = q[0] * 0.01 * np.exp(-10.0 * det)
-    e1 = 0.01 * np.sin(0.5 * np.pi * t)
-    e2 = 0.01 * np.sin(0.5 * np.pi * t + 0.5 * np.pi)
-    e3 = 0.01 * np.sin(0.5 * np.pi * t + np.pi)
+    sine, cosine = sincos(0.5 * np.pi * t)
+    e1, e2, e3 = 0.01 * sine, 0.01 * cosine, -0.01 * sine  # 0.01 sin(pi t / 2 + 0, pi / 2, pi)
     z1, z2, z3, _ = solve3(
         m11 + lam, m12 + lam * e3, m13 + lam * e2, m22 + lam, m23 + lam * e1, m33 + lam, hdot1, hdot2, hdot3
     )

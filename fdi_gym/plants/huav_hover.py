@@ -52,7 +52,7 @@ Version history: v0, the first.
 from __future__ import annotations
 
 import bisect
-import itertools
+import functools
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -65,9 +65,11 @@ from fdi_gym.acting import Acting, Probe
 from fdi_gym.checks import number
 from fdi_gym.drawing import random_sign, uniform
 from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Hold, Samples, Scoring, Square
+from fdi_gym.integration import first_order
 from fdi_gym.kernels import kernel
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
 from fdi_gym.shapes import Nothing, Shapes
+from fdi_gym.trigonometry import sincos
 
 ID = "HUAVHover"
 VERSION = 0
@@ -162,7 +164,7 @@ def dynamics(t, x, u, theta, d, p, dx):
     qt = CQ_T * tt * np.sqrt(tt) + DQ_T
     a1, b1 = k_b * lon + K_F * a1f, k_b * lat + K_F * b1f
     hub = tm * H_MR + K_BETA
-    sin_phi, cos_phi, sin_pitch, cos_pitch = np.sin(phi), np.cos(phi), np.sin(pitch), np.cos(pitch)
+    (sin_phi, cos_phi), (sin_pitch, cos_pitch) = sincos(phi), sincos(pitch)
     psi_rate = (pitch_rate * sin_phi + yaw_rate * cos_phi) / cos_pitch
 
     dx[0] = -G * sin_pitch - tm * a1 * per_m + p[6] * d[0]
@@ -192,7 +194,7 @@ def jacobian(t, x, u, theta, d, p, J_x, J_theta, J_d, J_p):
     a1, b1 = k_b * lon + K_F * x[9], k_b * lat + K_F * x[10]
     hub = tm * H_MR + K_BETA
     force, roll, tilt = tm * per_m, hub * per_jxx, hub * per_jyy  # per radian of a1 or b1
-    sin_phi, cos_phi, sin_pitch, cos_pitch = np.sin(phi), np.cos(phi), np.sin(pitch), np.cos(pitch)
+    (sin_phi, cos_phi), (sin_pitch, cos_pitch) = sincos(phi), sincos(pitch)
     sec, tan = 1.0 / cos_pitch, sin_pitch / cos_pitch
     nod = pitch_rate * cos_phi - yaw_rate * sin_phi  # dx[7]
     turn = pitch_rate * sin_phi + yaw_rate * cos_phi  # cos_pitch dx[8]
@@ -250,20 +252,21 @@ def control(t, y, r, q, c, u):
     observer over a sample, actuator errors that are allowed for (4).
     """
     k_h, decay = q[75], q[76]
-    for i in range(4):
-        u[i] = q[60 + i]
-        for j in range(9):
+    u_0, u_1, u_2, u_3 = q[60], q[61], q[62], q[63]
+    for j in range(15):
+        if j < 9:
             e = y[j] - q[64 + j]
             if j < 3:
                 e = min(max(e, -ERROR_CLIP[j]), ERROR_CLIP[j])
             elif j == 8:
                 e = min(max(e, -ERROR_CLIP[3]), ERROR_CLIP[3])
-            u[i] -= q[15 * i + j] * e
-        for j in range(2):
-            u[i] -= q[15 * i + 9 + j] * (c[4 + j] - q[73 + j])
-        for j in range(4):
-            u[i] -= q[15 * i + 11 + j] * c[j]
-        u[i] -= q[77 + i]
+        elif j < 11:
+            e = c[j - 5] - q[64 + j]
+        else:
+            e = c[j - 11]
+        u_0, u_1, u_2, u_3 = u_0 - q[j] * e, u_1 - q[15 + j] * e, u_2 - q[30 + j] * e, u_3 - q[45 + j] * e
+    u[0], u[1], u[2], u[3] = u_0 - q[77], u_1 - q[78], u_2 - q[79], u_3 - q[80]
+    for i in range(4):
         u[i] = min(max(u[i], U_MIN[i]), U_MAX[i])
     for j in range(4):
         c[j] = min(max(c[j] + DT * y[INTEGRATED[j]], -INTEGRAL_CLIP), INTEGRAL_CLIP)
@@ -441,21 +444,27 @@ CALM = np.zeros(2)  # m/s: no gusts
 PAPER_GUSTS = {"u_g": gust(2.0, 2.0, 4.0), "v_g": gust(5.0, 2.0, 3.0)}
 
 
+@functools.lru_cache(maxsize=4)
+def _times(steps: int) -> np.ndarray:
+    return np.arange(steps + 1) * DT
+
+
 def disturbance_rows(scenario: FaultScenario) -> np.ndarray:
     """d (steps + 1, 2): the gust at the samples."""
     if not scenario.disturbance:
         return np.broadcast_to(CALM, (scenario.steps + 1, 2))
     d = np.zeros((scenario.steps + 1, 2))
-    t = np.arange(scenario.steps + 1) * DT
+    t = _times(scenario.steps)
     for name, g in scenario.disturbance.items():
         rise, speed, column = g["rise"], g["speed"], d[:, ("u_g", "v_g").index(name)]
         s = t - g["t0"]
-        first, held = s.searchsorted((0.0, rise), "right")
+        first, held = s.searchsorted(0.0, "right"), s.searchsorted(rise, "right")
         column[first:held] = speed / 2 * (1 - np.cos(np.pi * (s[first:held] / rise)))
         column[held:] = speed
         if g["hold"] is not None:
-            fall = s - rise - g["hold"]
+            fall = s[held:] - rise - g["hold"]
             first, over = fall.searchsorted(0.0, "right"), fall.searchsorted(rise, "left")
+            column = column[held:]
             column[first:over] = speed / 2 * (1 + np.cos(np.pi * (fall[first:over] / rise)))
             column[over:] = 0.0
     return d
@@ -495,9 +504,9 @@ def sample(rng: np.random.Generator) -> FaultScenario:
         elif kind == 2:
             sigma = uniform(rng, *DRIFT[c])
             first = sigma * rng.standard_normal()
-            news = (sigma * DRIFT_NEW * rng.standard_normal(k1 - k0)).tolist()
-            drift = itertools.accumulate(news[:-1], lambda s, new: DRIFT_DECAY * s + new, initial=first)
-            faults.append(floating(channel, [centre + s for s in drift], k0, k1))
+            news = sigma * DRIFT_NEW * rng.standard_normal(k1 - k0)
+            drift = first_order(DRIFT_DECAY, np.concatenate([[first], news[:-1]]))
+            faults.append(floating(channel, (centre + drift).tolist(), k0, k1))
         else:
             faults.append(loss(channel, uniform(rng, *LOSS[c]), k0, k1))
     gusts = {}

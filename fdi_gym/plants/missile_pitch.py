@@ -63,6 +63,7 @@ from fdi_gym.faults import MAX_STEPS, Abrupt, Fault, FaultProcess, FaultScenario
 from fdi_gym.kernels import kernel
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
 from fdi_gym.shapes import Shapes, only_with
+from fdi_gym.trigonometry import sincos
 
 ID = "MissilePitch"
 VERSION = 0
@@ -127,7 +128,7 @@ def dynamics(t, x, u, theta, d, p, dx):
     C_m0 = moment(alpha, mach, A_M * (1.0 + p[3]), B_M * (1.0 + p[4]), C_M * (1.0 + p[5]))
     C_m = C_m0 + (1.0 - theta[2]) * D_M * (1.0 + p[7]) * delta
     Z_1 = K1 * K_Q * mach * mach * abs(B_M) * alpha * abs(alpha)
-    dx[0] = K_ALPHA * mach * np.cos(alpha) * normal(mach, alpha, delta, theta, p) + q
+    dx[0] = K_ALPHA * mach * sincos(alpha)[1] * normal(mach, alpha, delta, theta, p) + q
     dx[1] = K_Q * mach * mach * C_m + (1.0 - theta[4]) * L_J * jet + theta[0] * Z_1
     if theta[1] != 0.0:  # a tenth of the time of a flight would go into an exponential that counts for nothing
         Z_2 = L2 * np.exp(-((alpha / ALPHA_J) ** 2))
@@ -143,7 +144,8 @@ def jacobian(t, x, u, theta, d, p, J_x, J_theta, J_d, J_p):
     """Partial derivatives of `dynamics`."""
     alpha, delta, size = x[0], x[2], abs(x[0])
     mach = MACH + d[0] + d[1] * t
-    fin, pitching, lifting = 1.0 - theta[2], K_Q * mach * mach, K_ALPHA * mach * np.cos(alpha)
+    sin_alpha, cos_alpha = sincos(alpha)
+    fin, pitching, lifting = 1.0 - theta[2], K_Q * mach * mach, K_ALPHA * mach * cos_alpha
     a_n, b_n, c_n, d_n = A_N * (1.0 + p[0]), B_N * (1.0 + p[1]), C_N * (1.0 + p[2]), D_N * (1.0 + p[6])
     a_m, b_m, c_m, d_m = A_M * (1.0 + p[3]), B_M * (1.0 + p[4]), C_M * (1.0 + p[5]), D_M * (1.0 + p[7])
     C_n, C_m0 = normal(mach, alpha, delta, theta, p), moment(alpha, mach, a_m, b_m, c_m)
@@ -152,7 +154,7 @@ def jacobian(t, x, u, theta, d, p, J_x, J_theta, J_d, J_p):
 
     by_alpha_n = 3.0 * a_n * alpha * alpha + 2.0 * b_n * size + c_n * (2.0 - mach / 3.0)
     by_alpha_m = 3.0 * a_m * alpha * alpha + 2.0 * b_m * size + c_m * (-7.0 + 8.0 * mach / 3.0)
-    J_x[0, 0] = lifting * by_alpha_n - K_ALPHA * mach * np.sin(alpha) * C_n
+    J_x[0, 0] = lifting * by_alpha_n - K_ALPHA * mach * sin_alpha * C_n
     J_x[0, 1], J_x[0, 2] = 1.0, lifting * fin * d_n
     J_x[1, 0] = pitching * (by_alpha_m + theta[0] * 2.0 * K1 * abs(B_M) * size)
     J_x[1, 0] -= theta[1] * leak * 2.0 * alpha / (ALPHA_J * ALPHA_J)
@@ -165,7 +167,7 @@ def jacobian(t, x, u, theta, d, p, J_x, J_theta, J_d, J_p):
     J_theta[1, 0], J_theta[1, 1] = aero * mach * mach, leak
     J_theta[1, 2], J_theta[1, 4] = -pitching * d_m * delta, -L_J * x[4]
 
-    by_mach_n = K_ALPHA * np.cos(alpha) * (C_n - mach * c_n * alpha / 3.0)
+    by_mach_n = K_ALPHA * cos_alpha * (C_n - mach * c_n * alpha / 3.0)
     by_mach_m = 2.0 * K_Q * mach * C_m + pitching * c_m * alpha * 8.0 / 3.0 + theta[0] * 2.0 * aero * mach
     J_d[0, 0], J_d[0, 1], J_d[1, 0], J_d[1, 1] = by_mach_n, by_mach_n * t, by_mach_m, by_mach_m * t
 
@@ -207,7 +209,7 @@ def command(t, y, r, law, c, u):
     delta_hat, alpha_r = c[0], c[4]
     fin, jet = 1.0 - law[8], 1.0 - law[10]
     C_n = force(alpha, mach, A_N, B_N, C_N) + fin * D_N * delta_hat
-    q_c = OMEGA_A * (alpha_r - alpha) - K_ALPHA * mach * np.cos(alpha) * C_n
+    q_c = OMEGA_A * (alpha_r - alpha) - K_ALPHA * mach * sincos(alpha)[1] * C_n
     e = q_c - q
     c[3] = min(max(c[3] + DT * OMEGA_Q * OMEGA_Q * e, -I_MAX), I_MAX)
     v = 2.0 * ZETA_Q * OMEGA_Q * e + c[3]
@@ -226,6 +228,17 @@ def command(t, y, r, law, c, u):
     u[0] = min(max(delta_c, -DELTA_MAX), DELTA_MAX)
 
 
+def over_a_sample(*rows: tuple[float, ...]) -> tuple[float, ...]:
+    """The matrix, row by row, that the plant's own Runge-Kutta steps of a sample make of z' = A z."""
+    hA, one = DT / SUBSTEPS * np.array(rows), np.eye(len(rows))
+    step = one + hA @ (one + hA / 2 @ (one + hA / 3 @ (one + hA / 4)))
+    return tuple(np.linalg.matrix_power(step, SUBSTEPS).ravel().tolist())
+
+
+FIN = over_a_sample((0.0, 1.0), (-OMEGA_F * OMEGA_F, -2.0 * ZETA_F * OMEGA_F))  # delta^ and its rate, about the command
+JET = over_a_sample((-1.0 / TAU_J,))  # the plant's own steps, so that delta^ = delta without a fault
+
+
 @kernel
 def control(t, y, r, q, c, u):
     """The command, then one sample of what the computer models: c = (delta^, its rate, j^, I, alpha_r, its rate).
@@ -234,22 +247,9 @@ def control(t, y, r, q, c, u):
     parameter that the inversion allows for (5); the amplitude of the jet's dither, against which the fin moves.
     """
     command(t, y, r, q, c, u)
-    h = DT / SUBSTEPS
-    for _ in range(SUBSTEPS):  # the same Runge-Kutta steps as the plant's, so that delta^ = delta without a fault
-        p1, v1 = c[1], OMEGA_F * OMEGA_F * (u[0] - c[0]) - 2.0 * ZETA_F * OMEGA_F * c[1]
-        a, b = c[0] + 0.5 * h * p1, c[1] + 0.5 * h * v1
-        p2, v2 = b, OMEGA_F * OMEGA_F * (u[0] - a) - 2.0 * ZETA_F * OMEGA_F * b
-        a, b = c[0] + 0.5 * h * p2, c[1] + 0.5 * h * v2
-        p3, v3 = b, OMEGA_F * OMEGA_F * (u[0] - a) - 2.0 * ZETA_F * OMEGA_F * b
-        a, b = c[0] + h * p3, c[1] + h * v3
-        p4, v4 = b, OMEGA_F * OMEGA_F * (u[0] - a) - 2.0 * ZETA_F * OMEGA_F * b
-        c[0] += h / 6.0 * (p1 + 2.0 * (p2 + p3) + p4)
-        c[1] += h / 6.0 * (v1 + 2.0 * (v2 + v3) + v4)
-        j1 = (u[1] - c[2]) / TAU_J
-        j2 = (u[1] - (c[2] + 0.5 * h * j1)) / TAU_J
-        j3 = (u[1] - (c[2] + 0.5 * h * j2)) / TAU_J
-        j4 = (u[1] - (c[2] + h * j3)) / TAU_J
-        c[2] += h / 6.0 * (j1 + 2.0 * (j2 + j3) + j4)
+    away, rate = c[0] - u[0], c[1]
+    c[0], c[1] = u[0] + FIN[0] * away + FIN[1] * rate, FIN[2] * away + FIN[3] * rate
+    c[2] = u[1] + JET[0] * (c[2] - u[1])
     alpha_r, alpha_r_dot = c[4], c[5]
     c[4] = q[0] * alpha_r + q[1] * alpha_r_dot + q[4] * r[0]
     c[5] = q[2] * alpha_r + q[3] * alpha_r_dot + q[5] * r[0]

@@ -46,7 +46,6 @@ Version history: v0, the first.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple
 
@@ -57,6 +56,7 @@ from msgspec import UNSET, Meta, UnsetType
 from fdi_gym.acting import Acting, Probe, square
 from fdi_gym.drawing import uniform
 from fdi_gym.faults import Abrupt, Fault, FaultProcess, FaultScenario, Incipient, Intermittent, Scoring, Seed
+from fdi_gym.integration import first_order
 from fdi_gym.kernels import kernel
 from fdi_gym.plant import FaultMode, Kernels, Label, Plant, Signal
 from fdi_gym.shapes import Shapes, together
@@ -237,8 +237,7 @@ def drain_rows(scenario: FaultScenario) -> np.ndarray:
     n = np.random.default_rng(scenario.disturbance["seed"]).standard_normal(scenario.steps + 1)
     a = float(np.exp(-DT / TAU_D))
     n[1:] *= np.sqrt(1.0 - a * a)
-    course = itertools.accumulate(n.tolist(), lambda d, new: a * d + new)
-    return scenario.disturbance["sigma"] * np.array(list(course))[:, None]
+    return scenario.disturbance["sigma"] * first_order(a, n)[:, None]
 
 
 def physical(changes: Mapping[str, Any]) -> np.ndarray:
