@@ -152,7 +152,7 @@ def stack(size: int) -> Any:
 
     def _room_at(typing_context):
         def codegen(context, builder, signature, arguments):
-            room = cgutils.alloca_once(builder, ir.ArrayType(ir.DoubleType(), size))
+            room = cgutils.alloca_once(builder, ir.ArrayType(ir.DoubleType(), max(size, 1)))
             return builder.bitcast(room, context.get_value_type(signature.return_type))
 
         return types.CPointer(float64)(), codegen

@@ -102,6 +102,14 @@ class Model:
         return Addresses(*map(kernels.address, (interval, *others)))
 
     @functools.cached_property
+    def lanes(self) -> int:
+        """Address of `integration.lanes` around its kernels."""
+        from fdi_gym import integration, kernels
+
+        own, sizes = self.kernels, (*self._widths[:2], self.own_theta, *self._widths[3:])
+        return kernels.address(integration.lanes(not self.substeps, sizes, own.dynamics, own.project or kernels.project))
+
+    @functools.cached_property
     def tangent(self) -> int:
         """Address of `tangent.tangent` around its kernels; 0 where it says no derivatives."""
         from fdi_gym import kernels
@@ -154,7 +162,7 @@ class Model:
 
         x = np.asarray(x, float)
         rows = self._rows_of(t, x, u, theta, d, p, len(self.states))
-        integration.propagate(self.addresses.interval, self.dt, self.substeps, *rows)
+        integration.propagate(self.addresses.interval, self.lanes, self.dt, self.substeps, *rows)
         return rows[-1].reshape(x.shape)
 
     def measure(

@@ -10,7 +10,7 @@ import pytest
 from conftest import ROOT, build
 
 from fdi_gym import integration
-from fdi_gym.discovery import load_plant
+from fdi_gym.discovery import load_plant, plant_sources
 from fdi_gym.drawing import random_sign, stream, streams, uniform
 from fdi_gym.engine import no_noise, simulate, white_noise
 from fdi_gym.faults import (
@@ -38,8 +38,13 @@ def test_rk4_is_of_fourth_order(motor):
     flow, steps = {}, (16, 32, 64, 2048)
     for n in steps:
         out = np.empty((1, 2))
-        where, u, theta, d = motor.addresses.interval, np.array([[12.0]]), np.array([[1.0, 0.5, 0.0]]), np.array([[0.02]])
-        integration.propagate(where, 8e-3, n, np.zeros(1), x, u, theta, d, motor.nominal_p[None], out)
+        where, u, theta, d = (
+            (motor.addresses.interval, motor.lanes),
+            np.array([[12.0]]),
+            np.array([[1.0, 0.5, 0.0]]),
+            np.array([[0.02]]),
+        )
+        integration.propagate(*where, 8e-3, n, np.zeros(1), x, u, theta, d, motor.nominal_p[None], out)
         flow[n] = out
     error = [np.abs(flow[n] - flow[2048]).max() for n in steps[:3]]
     assert error[0] / error[1] == pytest.approx(16, rel=0.1)
@@ -252,15 +257,32 @@ def test_registered_plant_has_its_environment(motor):
 
 def test_sines_and_cosines_are_right_to_less_than_two_rounding_units():
     rng = np.random.default_rng(0)
-    x = np.concatenate([
+    near = np.concatenate([
         rng.uniform(-7, 7, 20_000), rng.uniform(-1e5, 1e5, 20_000), 10.0 ** rng.uniform(-300, 0, 2000),
-        np.arange(-4000, 4001) * (np.pi / 4), rng.uniform(-1, 1, 2000) * 10.0 ** rng.uniform(5, 300, 2000), [0.0, -0.0],
+        np.arange(-4000, 4001) * (np.pi / 4), [0.0],
     ])  # fmt: skip
-    found = np.array([sincos(value) for value in x.tolist()]).T
-    exact = np.array([np.sin(x.astype(np.longdouble)), np.cos(x.astype(np.longdouble))])
-    assert np.abs(found - exact).max() < 1.6e-16
-    assert (np.abs(found) <= 1.0).all()
+    far = rng.uniform(-1, 1, 2000) * 10.0 ** rng.uniform(5, 15, 2000)
+    for x, bound in ((near, 1.6e-16), (far, 1.6e-16 + np.spacing(np.abs(far)))):
+        found = np.array([sincos(value) for value in x.tolist()]).T
+        exact = np.array([np.sin(x.astype(np.longdouble)), np.cos(x.astype(np.longdouble))])
+        assert (np.abs(found - exact) < bound).all()
+    assert all(abs(part) <= 1.0 for value in 10.0 ** rng.uniform(5, 308, 2000) for part in sincos(value))
     assert np.isnan([sincos(value) for value in (np.nan, np.inf, -np.inf)]).all()
+
+
+@pytest.mark.parametrize("name", [*plant_sources()])
+def test_points_moved_side_by_side_are_moved_one_by_one(name):
+    plant, rng = load_plant(name), np.random.default_rng(0)
+    nominal, scale = ([getattr(s, field) for s in (*plant.states, *plant.commands)] for field in ("nominal", "scale"))
+    for count in (1, 2, 3, 8, 29):
+        z = nominal + 0.3 * np.array(scale) * rng.standard_normal((count, len(nominal)))
+        x, u = z[:, : len(plant.states)], z[:, len(plant.states) :]
+        theta = plant.nominal_theta + 0.3 * rng.random((count, len(plant.theta)))
+        d, t = rng.standard_normal((count, len(plant.disturbances))), rng.uniform(0, 10, count)
+        moved = plant.propagate(t, x, u, theta, d)
+        assert np.isfinite(moved).all()
+        alone = [plant.propagate(t[i], x[i : i + 1], u[i], theta[i], d[i])[0] for i in range(count)]
+        np.testing.assert_array_equal(moved, alone)
 
 
 def test_small_solves_are_lapacks():

@@ -4,7 +4,7 @@ import numpy as np
 from numba import float64, int64, void
 
 from fdi_gym.estimation.gaussian_points import UNSCENTED, factor, moments_of_points, spread, squared_step
-from fdi_gym.integration import interval_at
+from fdi_gym.integration import LANES, lanes_at
 from fdi_gym.kernels import M, V, compiled, helper
 
 M3 = float64[:, :, ::1]
@@ -19,29 +19,41 @@ def put_back(xi, sign, x):
 
 
 @compiled(void(int64, float64, int64, V, M, M3, V, M, M, M, M3, V))
-def predict(interval_address, dt, substeps, physical, X, P, sign, u, Q, X1, P1, sign1):
+def predict(lanes_address, dt, substeps, physical, X, P, sign, u, Q, X1, P1, sign1):
     """X1, P1 and the signs one sample after X = (q1..q3, rest, theta) (n, N), P (n, N, N) and sign (n,) under u (n, n_u).
 
     Q (N, N) is what a sample adds; theta stays.
     """
-    interval = interval_at(interval_address)
+    lanes = lanes_at(lanes_address)
     (n, N), n_theta = X.shape, u.shape[1]
-    n_x = N - n_theta + 1
-    x, course, theta_now, d = np.empty(n_x), np.zeros((3, n_theta)), np.empty(n_theta), np.zeros(0)
-    U, points, values, first = np.empty((N, N)), np.empty((2 * N + 1, N)), np.empty((2 * N + 1, N)), np.empty((N, N))
+    n_x, count = N - n_theta + 1, 2 * N + 1
+    T, x, us, theta = np.zeros(LANES), np.empty((n_x, LANES)), np.empty((n_theta, LANES)), np.empty((n_theta, LANES))
+    d, p, one = np.empty((0, LANES)), np.empty((physical.size, LANES)), np.empty(n_x)
+    U, points, values, first = np.empty((N, N)), np.empty((count, N)), np.empty((count, N)), np.empty((N, N))
     mean, cross, cov = np.empty(N), np.empty((N, N)), np.empty((N, N))
+    for j in range(physical.size):
+        p[j] = physical[j]
     for e in range(n):
         factor(P[e], U)
         spread(X[e], U, np.sqrt(squared_step(UNSCENTED, N)), points)
-        for i in range(2 * N + 1):
-            put_back(points[i, : n_x - 1], sign[e], x)
-            for j in range(n_theta):
-                course[0, j] = values[i, n_x - 1 + j] = points[i, n_x - 1 + j]
-            interval(0.0, dt, substeps, False, x, u[e], course, d, physical, theta_now)
-            if i == 0:
-                sign1[e] = -1.0 if x[3] < 0.0 else 1.0
-            for j in range(n_x - 1):
-                values[i, j] = x[j if j < 3 else j + 1]
+        for j in range(n_theta):
+            us[j] = u[e, j]
+        for start in range(0, count, LANES):
+            for lane in range(LANES):
+                i = min(start + lane, count - 1)
+                put_back(points[i, : n_x - 1], sign[e], one)
+                for j in range(n_x):
+                    x[j, lane] = one[j]
+                for j in range(n_theta):
+                    theta[j, lane] = points[i, n_x - 1 + j]
+            lanes(T, dt, substeps, x, us, theta, d, p)
+            for lane in range(min(LANES, count - start)):
+                for j in range(n_x - 1):
+                    values[start + lane, j] = x[j if j < 3 else j + 1, lane]
+                for j in range(n_x - 1, N):
+                    values[start + lane, j] = points[start + lane, j]
+            if start == 0:
+                sign1[e] = -1.0 if x[3, 0] < 0.0 else 1.0
         moments_of_points(UNSCENTED, U, N, values, first, mean, cross, cov)
         for i in range(N):
             X1[e, i] = mean[i]

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fdi_gym.estimation.gaussian_points import ADDRESSES
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, Plant
 
@@ -28,7 +29,7 @@ class Model(NamedTuple):
     def __reduce__(self) -> tuple[Any, ...]:
         """Copied and pickled without the addresses of compiled code, which hold in this process only."""
         integers, *rest = self.constants
-        blank = np.concatenate([np.zeros(3, np.int64), integers[3:]])
+        blank = np.concatenate([np.zeros(ADDRESSES, np.int64), integers[ADDRESSES:]])
         return _with_addresses, (self.plant, self.m, (blank, *rest), *self[3:])
 
 
@@ -81,7 +82,7 @@ def bind(
     if H is not None and (observed.shape != (m, N) or not np.isfinite(observed).all()):
         raise ValueError(f"H needs the shape ({m}, {N}) and finite numbers, not {observed.shape}")
     sizes = (plant.substeps, n_x, len(plant.outputs), n_theta, n_D, p, n_d, m, plant.own_theta, len(plant.commands))
-    integers = np.concatenate([[0, 0, 0, *sizes], *where.values()]).astype(np.int64)
+    integers = np.concatenate([np.zeros(ADDRESSES), sizes, *where.values()]).astype(np.int64)
     reals = np.concatenate([[plant.dt], plant.nominal_theta, plant.nominal_p])
     constants = (integers, reals, STEP * size, contiguous(offset), contiguous(direction))
     linear = _linear(plant, where["entries"])
@@ -90,7 +91,8 @@ def bind(
 
 def _with_addresses(plant: Plant, m: int, constants: tuple[Array, ...], *others: Any) -> Model:
     integers, *rest = constants
-    integers = np.concatenate([[plant.addresses.interval, plant.addresses.output, plant.tangent], integers[3:]])
+    addresses = plant.addresses.interval, plant.lanes, plant.addresses.output, plant.tangent
+    integers = np.concatenate([addresses, integers[ADDRESSES:]])
     return Model(plant, m, (integers, *rest), *others)
 
 

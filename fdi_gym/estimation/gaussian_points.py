@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from fdi_gym.integration import interval_at
+from fdi_gym.integration import FEW, LANES, interval_at, lanes_at
 from fdi_gym.kernels import helper, map_at
 
 EXTENDED, UNSCENTED, CENTRAL_DIFFERENCE = 0, 1, 2
 JITTER, RETRIES = 1e-14, 7  # added to the diagonal where the factorisation fails, times 100 at each retry
-# The integers of a model: three addresses (the third may be 0), sizes, then the lists (entries, disturbances, sensors)
-INTERVAL, OUTPUT, TANGENT = range(3)
-SUBSTEPS, STATES, OUTPUTS, THETA, KNOWN, ENTRIES, DISTURBANCES, SENSORS, OWN, COMMANDS, SIZES = range(3, 14)
+# The integers of a model: four addresses (the last may be 0), sizes, then the lists (entries, disturbances, sensors)
+INTERVAL, OF_LANES, OUTPUT, TANGENT, ADDRESSES = range(5)
+SUBSTEPS, STATES, OUTPUTS, THETA, KNOWN, ENTRIES, DISTURBANCES, SENSORS, OWN, COMMANDS, SIZES = range(4, 15)
 
 
 @helper
@@ -29,45 +29,105 @@ def put_magnitudes(integers, offset, direction, X, nominal, now):
 
 
 @helper
+def other_magnitudes(integers, direction, points, i):
+    """Whether point i has other magnitudes than the one before, or there is none before."""
+    n_x, other = integers[STATES], i == 0
+    for j in range(n_x, n_x + direction.shape[1]):
+        other = other or points[i, j] != points[i - 1, j]
+    return other
+
+
+@helper
 def pass_points(moving, integers, reals, offset, direction, t, points, u, known, values):
     """f (moving) or h of points (M, N) of an episode on the line (offset (p,), direction (p, n_m)).
 
     That is the state one sample later, or what the chosen sensors read.
     """
-    interval, output = interval_at(integers[INTERVAL]), map_at(integers[OUTPUT])
-    substeps, n_x, n_y, n_theta = integers[SUBSTEPS], integers[STATES], integers[OUTPUTS], integers[THETA]
-    p, n_d, m, own = integers[ENTRIES], integers[DISTURBANCES], integers[SENSORS], integers[OWN]
-    n_m = direction.shape[1]
+    if not moving:
+        read_points(integers, reals, offset, direction, t, points, u, known, values)
+    elif points.shape[0] < FEW:
+        move_points(integers, reals, offset, direction, t, points, u, known, values)
+    else:
+        move_lanes(integers, reals, offset, direction, t, points, u, known, values)
+
+
+@helper
+def read_points(integers, reals, offset, direction, t, points, u, known, values):
+    """What the chosen sensors read at the points."""
+    output = map_at(integers[OUTPUT])
+    n_x, n_y, n_theta, p = integers[STATES], integers[OUTPUTS], integers[THETA], integers[ENTRIES]
+    n_d, m, own, n_m = integers[DISTURBANCES], integers[SENSORS], integers[OWN], direction.shape[1]
     disturbances, sensors = integers[SIZES + p : SIZES + p + n_d], integers[SIZES + p + n_d :]
-    dt, nominal = reals[0], reals[1:]
-    now = nominal.copy()
-    theta, physical = now[:n_theta], now[n_theta:]
-    x, y, theta_now, course = np.empty(n_x), np.empty(n_y), np.empty(own), np.zeros((3, own))
-    theta_p = theta[:own]  # the rest are faults of the sensors
-    d = known.copy()
+    nominal = reals[1:]
+    now, d, x, y = nominal.copy(), known.copy(), np.empty(n_x), np.empty(n_y)
+    theta, theta_p, physical = now[:n_theta], now[:own], now[n_theta:]  # beyond the plant's own are faults of the sensors
     for i in range(points.shape[0]):
-        moved = i == 0
-        for j in range(n_x, n_x + n_m):
-            moved = moved or points[i, j] != points[i - 1, j]
-        if moved:  # the magnitudes, of which most points have those of the one before
+        if other_magnitudes(integers, direction, points, i):
             put_magnitudes(integers, offset, direction, points[i], nominal, now)
         for j in range(n_d):
             d[disturbances[j]] = points[i, n_x + n_m + j]
         for j in range(n_x):
             x[j] = points[i, j]
-        if moving:
-            for j in range(own):
-                course[0, j] = theta[j]
-            interval(t, dt, substeps, False, x, u, course, d, physical, theta_now)
+        output(t, x, u, theta_p, d, physical, y)
+        if own < n_theta:  # gains, then biases
+            for j in range(n_y):
+                y[j] += y[j] * theta[own + j] + theta[own + n_y + j]
+        for j in range(m):
+            values[i, j] = y[sensors[j]]
+
+
+@helper
+def move_points(integers, reals, offset, direction, t, points, u, known, values):
+    """The states one sample after the points, one by one."""
+    interval = interval_at(integers[INTERVAL])
+    n_x, p, n_d, own, n_m = integers[STATES], integers[ENTRIES], integers[DISTURBANCES], integers[OWN], direction.shape[1]
+    disturbances, nominal = integers[SIZES + p : SIZES + p + n_d], reals[1:]
+    now, d, x, theta, course = nominal.copy(), known.copy(), np.empty(n_x), np.empty(own), np.zeros((3, own))
+    physical = now[integers[THETA] :]
+    for i in range(points.shape[0]):
+        if other_magnitudes(integers, direction, points, i):
+            put_magnitudes(integers, offset, direction, points[i], nominal, now)
+        for j in range(n_d):
+            d[disturbances[j]] = points[i, n_x + n_m + j]
+        for j in range(n_x):
+            x[j] = points[i, j]
+        for j in range(own):
+            course[0, j] = now[j]
+        interval(t, reals[0], integers[SUBSTEPS], False, x, u, course, d, physical, theta)
+        for j in range(n_x):
+            values[i, j] = x[j]
+
+
+@helper
+def move_lanes(integers, reals, offset, direction, t, points, u, known, values):
+    """The same, so many at a time."""
+    lanes = lanes_at(integers[OF_LANES])
+    n_x, n_theta, p, n_d = integers[STATES], integers[THETA], integers[ENTRIES], integers[DISTURBANCES]
+    own, n_m, M, nominal = integers[OWN], direction.shape[1], points.shape[0], reals[1:]
+    disturbances, now = integers[SIZES + p : SIZES + p + n_d], nominal.copy()
+    T, X, U, D = np.full(LANES, t), np.empty((n_x, LANES)), np.empty((u.size, LANES)), np.empty((known.size, LANES))
+    acts, P = np.empty((own, LANES)), np.empty((now.size - n_theta, LANES))
+    for j in range(u.size):
+        U[j] = u[j]
+    for j in range(known.size):
+        D[j] = known[j]
+    for first in range(0, M, LANES):
+        for lane in range(LANES):
+            i = min(first + lane, M - 1)
+            if other_magnitudes(integers, direction, points, i):
+                put_magnitudes(integers, offset, direction, points[i], nominal, now)
+            for j in range(n_d):
+                D[disturbances[j], lane] = points[i, n_x + n_m + j]
             for j in range(n_x):
-                values[i, j] = x[j]
-        else:
-            output(t, x, u, theta_p, d, physical, y)
-            if own < n_theta:  # gains, then biases
-                for j in range(n_y):
-                    y[j] += y[j] * theta[own + j] + theta[own + n_y + j]
-            for j in range(m):
-                values[i, j] = y[sensors[j]]
+                X[j, lane] = points[i, j]
+            for j in range(own):
+                acts[j, lane] = now[j]
+            for j in range(n_theta, now.size):
+                P[j - n_theta, lane] = now[j]
+        lanes(T, reals[0], integers[SUBSTEPS], X, U, acts, D, P)
+        for lane in range(min(LANES, M - first)):
+            for j in range(n_x):
+                values[first + lane, j] = X[j, lane]
 
 
 @helper
