@@ -104,7 +104,9 @@ class Recording:
                     store = self._wide[name] = np.full((*self._shape, value.shape[1]), np.nan)
                 store[:, k] = value
         for name, value in (said.signals or {}).items() if self._signals else ():
-            self._own.setdefault(name, np.full((*self._shape, *value.shape[1:]), np.nan))[:, k] = value
+            if name not in self._own:
+                self._own[name] = np.full((*self._shape, *value.shape[1:]), np.nan)
+            self._own[name][:, k] = value
 
     def decisions(self) -> Decisions:
         """All of it."""

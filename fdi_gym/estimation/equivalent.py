@@ -8,7 +8,10 @@ the one with the expected sign.
 from __future__ import annotations
 
 import numpy as np
+from numba import boolean, int64, void
 
+from fdi_gym.kernels import M, compiled, helper
+from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, Plant
 
 CLEAR = 4.0  # ratio of squared distances: noise about zero turns no sign, nor does a prior that says little
@@ -36,22 +39,37 @@ def nearest(plant: Plant, y: Array, seen: Array, expected: Array) -> Array:
         if turns.any():
             found = np.where(turns != 0.0, y - np.where(np.isfinite(periods), periods, 0.0) * turns, y)
     for quaternion in plant.quaternions:
-        vector, sign = list(quaternion[:3]), quaternion[3]
-        parts = [*vector, sign]
-        p, there = np.nan_to_num(expected[:, parts]), seen[:, parts] & np.isfinite(expected[:, parts])
-        q = y[:, parts]
-        opposite = there[:, 3] & (q[:, 3] * p[:, 3] < 0.0)
-        p[:, 3] *= _scalar(p[:, :3])
-        q[:, 3] *= np.where(there[:, :3].all(axis=1), _scalar(q[:, :3]), np.abs(p[:, 3]))
-        same, other = (np.where(there, (q - e) ** 2, 0.0).sum(axis=1) for e in (p, -p))
-        clear = CLEAR * np.minimum(same, other) < np.maximum(same, other)
-        turned = np.where(clear, other < same, opposite)
-        if turned.any():
-            found = found.copy()
-            found[:, parts] *= np.where(turned, -1.0, 1.0)[:, None]
+        if found is y:
+            found = y.copy()
+        _turn(np.array(quaternion), contiguous(y), np.ascontiguousarray(seen), contiguous(expected), found)
     return found
 
 
-def _scalar(v: Array) -> Array:
-    """Magnitude (n,) of a unit quaternion's scalar part, from its vector part (n, 3)."""
-    return np.sqrt(np.maximum(0.0, 1.0 - (v**2).sum(axis=1)))
+@helper
+def _scalar(v):
+    """Magnitude of a unit quaternion's scalar part, from its vector part (3,)."""
+    return np.sqrt(max(0.0, 1.0 - (v[0] * v[0] + v[1] * v[1] + v[2] * v[2])))
+
+
+@compiled(void(int64[::1], M, boolean[:, ::1], M, M))
+def _turn(parts, y, seen, expected, found):
+    """Turn the outputs `parts` (4,), vector and sign, of found (n, n_y) where the negative quaternion is what is meant."""
+    p, q, there = np.empty(4), np.empty(4), np.empty(4, np.bool_)
+    for e in range(len(y)):
+        for i in range(4):
+            q[i], p[i] = y[e, parts[i]], expected[e, parts[i]]
+            there[i] = seen[e, parts[i]] and np.isfinite(p[i])
+            if not np.isfinite(p[i]):
+                p[i] = 0.0
+        opposite = there[3] and q[3] * p[3] < 0.0
+        p[3] *= _scalar(p)
+        q[3] *= _scalar(q) if there[0] and there[1] and there[2] else abs(p[3])
+        same = other = 0.0
+        for i in range(4):
+            if there[i]:
+                same += (q[i] - p[i]) ** 2
+                other += (q[i] + p[i]) ** 2
+        clear = CLEAR * min(same, other) < max(same, other)
+        if other < same if clear else opposite:
+            for i in range(4):
+                found[e, parts[i]] = -found[e, parts[i]]
