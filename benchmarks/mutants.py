@@ -36,6 +36,7 @@ from fdi_gym.files import write_whole
 from fdi_gym.tables import markdown
 
 ROOT = Path(__file__).parent.parent
+SLOW, LIMIT = 15.0, 600.0  # core-seconds: a test that takes longer is not run, and tests that take longer have failed
 MUTATED = [
     "fdi_gym/estimation", "fdi_gym/diagnosis", "baselines/filters", "baselines/learned",
     *(f"fdi_gym/{name}.py" for name in ("metrics", "scores", "intervals", "declaration", "tasks")),
@@ -61,6 +62,7 @@ import gc, importlib, json, os, signal, sys, types
 for name in ("gymnasium", "hypothesis", "joblib", "msgspec", "numba", "pytest", "scipy.linalg", "scipy.special",
              "scipy.stats", "stable_baselines3", "torch", "tqdm", "tyro"):
     importlib.import_module(name)
+import pytest
 
 def codes(code):
     yield code
@@ -81,20 +83,53 @@ def change(before, after):
             function.__code__ = into[function.__code__]
     return True
 
+seconds = {}  # of each test that has passed here, by its name; inf: it failed, or took too long
+
+class Ordered:
+    def __init__(self, how, most):
+        self.how, self.most = how, most
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items):
+        taken = {item: seconds.get(item.nodeid, 0) for item in items}
+        items[:] = sorted((item for item in items if taken[item] <= self.most), key=taken.get)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item):
+        if self.how != "here":
+            return (yield)
+        signal.signal(signal.SIGPROF, late)
+        signal.setitimer(signal.ITIMER_PROF, 2 * self.most)
+        try:
+            return (yield)
+        finally:
+            signal.setitimer(signal.ITIMER_PROF, 0)
+
+    def pytest_runtest_logreport(self, report):
+        found = report.duration if report.outcome != "failed" else float("inf")
+        seconds[report.nodeid] = found + (seconds.get(report.nodeid, 0) if report.when != "setup" else 0)
+
+def late(*_):
+    raise TimeoutError("a slow test")
+
 for line in sys.stdin:
-    how, limit, arguments, files = json.loads(line)
+    how, limit, most, arguments, files = json.loads(line)
+    if os.path.exists(sys.argv[2]):
+        seconds |= json.load(open(sys.argv[2]))
     child = 0 if how == "here" else os.fork()
     if not child:
         kept = os.dup(1)
         said = os.open(sys.argv[1], os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
         os.dup2(said, 1)
         os.dup2(said, 2)
-        signal.alarm(limit)
-        status = sys.modules["pytest"].main(arguments) if not files or change(*files) else 99
-        signal.alarm(0)
+        if how != "here":
+            signal.signal(signal.SIGPROF, signal.SIG_DFL)
+            signal.setitimer(signal.ITIMER_PROF, limit)
+        status = sys.modules["pytest"].main(arguments, [Ordered(how, most)]) if not files or change(*files) else 99
         sys.stdout.flush()
         if how != "here":
             os._exit(status)
+        json.dump(seconds, open(sys.argv[2], "w"))
         os.dup2(kept, 1)
     else:
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
@@ -112,6 +147,7 @@ class Mutant(msgspec.Struct):
     start: int  # of the text that changes, in bytes
     stop: int
     tests: list[str] = []
+    lived: bool = False  # in the running process
     killed: bool | None = None  # None: not run yet
     by: str = ""
     seconds: float = 0.0
@@ -229,52 +265,67 @@ class Tester:
             "PYTHONDONTWRITEBYTECODE": "", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
         }  # fmt: skip
         self.work, self.said, self.live = work, work / f"said-{live}.txt", live
+        self.seconds, self.warm = work / "seconds.json", dict[str, float]()
         self.passed: dict[str, bool] = {}
-        command = [sys.executable, "-c", FORKS, str(self.said)]
+        command = [sys.executable, "-c", FORKS, str(self.said), str(self.seconds)]
         self.process: Any = subprocess.Popen(
             command, cwd=work / "tree", env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
 
-    def _run(self, how: str, tests: str, limit: float, files: Sequence[Path] = ()) -> str:
+    def _run(self, how: str, tests: str, files: Sequence[Path] = ()) -> str:
+        """The first failure of tests that are not slow, quickest first; what takes much longer than ever before fails."""
         file, _, chosen = tests.partition(" -k ")
-        arguments = ["-x", "-q", "--no-header", "--tb=no", "-p", "no:cacheprovider", "-p", "no:xdist", "-rfE", file,
-                     *(["-k", chosen] if chosen else [])]  # fmt: skip
-        request = [how, round(limit), arguments, [str(file) for file in files]]
+        arguments = ["-q", "--no-header", "--tb=no", "-p", "no:cacheprovider", "-p", "no:xdist", "-rfE",
+                     *([file] if "::" in file else file.split()),
+                     *(["-k", chosen] if chosen else []), *(["-x"] if how == "fork" else [])]  # fmt: skip
+        request = [how, LIMIT, SLOW, arguments, [str(file) for file in files]]
         self.process.stdin.write(msgspec.json.encode(request).decode() + "\n")
         self.process.stdin.flush()
         status, said = int(self.process.stdout.readline()), self.said.read_text()
         if status in (0, 5, 99):  # 5: there are none
             return ""
-        failed = re.search(r"^(?:FAILED|ERROR) (\S+)", said, re.MULTILINE)
-        return failed.group(1) if failed else "time" if status == -signal.SIGALRM else said.strip()[-300:] or "a crash"
+        failed = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", said, re.MULTILINE)
+        return failed.group(1) if failed else "time" if status == -signal.SIGPROF else said.strip()[-300:] or "a crash"
 
     def passes(self, tests: str) -> bool:
-        """Whether tests pass without a change, where they will be run with one."""
+        """Whether tests pass without a change, where they have been run with one."""
         if tests not in self.passed:
-            by = self._run("here", tests, 3600) if self.live else ""
-            by = by or self._run("fork", tests, 3600)
-            self.passed[tests] = not by
-            print(f"without a change: {tests}: {by or 'passes'}", flush=True)
+            self.passed[tests] = not self._run("fork", tests)
         return self.passed[tests]
 
-    def first_failure(self, mutant: Mutant, tests: str) -> str:
-        """The first of some tests that fails with a change, or nothing."""
+    def warmed(self, tests: str) -> None:
+        """In a live one: the tests have been run here. Those that fail unchanged are not run again."""
+        if self.live and tests not in self.warm:
+            begun = time.monotonic()
+            by = self._run("here", tests)
+            self.warm[tests] = time.monotonic() - begun
+            print(f"without a change: {tests}: {by or 'passes'}, {self.warm[tests]:.0f} s", flush=True)
+
+    def first_failure(self, mutant: Mutant) -> str:
+        """The first of a mutant's tests that fails with the change and passes without, or nothing."""
         drawn, path = self.work / "drawn" / mutant.file, self.work / "tree" / mutant.file
         source = drawn.read_bytes()
         after = source[: mutant.start] + mutant.after.encode() + source[mutant.stop :]
-        limit = 900 if self.live else 1800
+        changed = self.work / "changed.py"
+        changed.write_bytes(after)
         if self.live:
-            changed = self.work / "changed.py"
-            changed.write_bytes(after)
-            return self._run("fork", tests, limit, (path, changed)) if self.passes(tests) else ""
-        try:
-            path.write_bytes(after)
-            by = self._run("fork", tests, limit)
-        finally:
-            copy_file(drawn, path)
-        if by and not self.passes(tests):
-            raise SystemExit(f"{tests} fail without any change")
-        return by
+            sets = sorted(mutant.tests, key=lambda tests: self.warm.get(tests, 0.0 if " -k " in tests else 60.0))
+        else:
+            chosen = [tests for tests in mutant.tests if " -k " in tests]
+            sets = [" ".join(tests for tests in mutant.tests if tests not in chosen), *chosen]
+        for tests in sets:
+            self.warmed(tests)
+            try:
+                if not self.live:
+                    path.write_bytes(after)
+                by = self._run("fork", tests, (path, changed) if self.live else ())
+            finally:
+                copy_file(drawn, path)
+            if by and self.passes(by if by.startswith("tests/") else tests):
+                return by
+            if by:
+                print(f"{by} fails without any change", flush=True)
+        return ""
 
 
 def copy_tree(tree: Path, only: str = ".") -> None:
@@ -307,16 +358,22 @@ def run(work: Path, seed: int, count: int, again: bool) -> list[Mutant]:
         mutants = draw(seed, count)
         write_whole(file, msgspec.json.encode(mutants))
     quick, sure = Tester(work, live=True), Tester(work, live=False)
-    for i, mutant in enumerate(mutants):
-        if mutant.killed or (mutant.killed is False and not again):
-            continue
-        begun, compiled = time.monotonic(), is_compiled(work / "drawn" / mutant.file)
-        tries = ((tester, tests) for tester in ((sure,) if compiled else (quick, sure)) for tests in mutant.tests)
-        mutant.by = next((by for tester, tests in tries if (by := tester.first_failure(mutant, tests))), "")
-        mutant.killed, mutant.seconds = bool(mutant.by), time.monotonic() - begun
-        write_whole(file, msgspec.json.encode(mutants))
-        print(i, mutant.file, mutant.line, mutant.before[:60], "->", mutant.after[:60], mutant.by or "SURVIVED",
-              f"{mutant.seconds:.0f} s", flush=True)  # fmt: skip
+    if again:
+        for mutant in mutants:
+            mutant.lived, mutant.killed = False, mutant.killed or None
+    for tester in (quick, sure):
+        for i, mutant in enumerate(mutants):
+            compiled = is_compiled(work / "drawn" / mutant.file)
+            if mutant.killed is not None or (tester is quick and (compiled or mutant.lived)):
+                continue
+            begun = time.monotonic()
+            mutant.by = tester.first_failure(mutant)
+            mutant.killed, mutant.lived = bool(mutant.by) or (None if tester is quick else False), not mutant.by
+            mutant.seconds += time.monotonic() - begun
+            write_whole(file, msgspec.json.encode(mutants))
+            became = mutant.by or ("lives" if tester is quick else "SURVIVED")
+            print(i, mutant.file, mutant.line, mutant.before[:60], "->", mutant.after[:60], became,
+                  f"{mutant.seconds:.0f} s", flush=True)  # fmt: skip
     return mutants
 
 
