@@ -24,6 +24,8 @@ import signal
 import subprocess
 import sys
 import time
+import types
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,7 +38,8 @@ from fdi_gym.files import write_whole
 from fdi_gym.tables import markdown
 
 ROOT = Path(__file__).parent.parent
-SLOW, LIMIT = 15.0, 600.0  # core-seconds: a test that takes longer is not run, and tests that take longer have failed
+OFTEN = 20
+SLOW, LIMIT = 15.0, 200.0  # core-seconds: a test that takes longer is not run, and tests that take longer have failed
 MUTATED = [
     "fdi_gym/estimation", "fdi_gym/diagnosis", "baselines/filters", "baselines/learned",
     *(f"fdi_gym/{name}.py" for name in ("metrics", "scores", "intervals", "declaration", "tasks")),
@@ -70,18 +73,12 @@ def codes(code):
         if isinstance(part, types.CodeType):
             yield from codes(part)
 
-def own(code):
-    return code.co_code, code.co_names, [c for c in code.co_consts if not isinstance(c, types.CodeType)]
-
 def change(before, after):
     pairs = list(zip(*(codes(compile(open(file).read(), before, "exec")) for file in (before, after)), strict=True))
-    if not all(old.co_flags & 1 for old, new in pairs if repr(own(old)) != repr(own(new))):
-        return False  # of a module's or class's own code, which has run
     into = {old: new for old, new in pairs if old != new}
     for function in gc.get_objects():
         if isinstance(function, types.FunctionType) and function.__code__ in into:
             function.__code__ = into[function.__code__]
-    return True
 
 seconds = {}  # of each test that has passed here, by its name; inf: it failed, or took too long
 
@@ -96,21 +93,19 @@ class Ordered:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item):
-        if self.how != "here":
-            return (yield)
         signal.signal(signal.SIGPROF, late)
-        signal.setitimer(signal.ITIMER_PROF, 2 * self.most)
+        signal.setitimer(signal.ITIMER_PROF, self.most)
         try:
             return (yield)
         finally:
             signal.setitimer(signal.ITIMER_PROF, 0)
 
     def pytest_runtest_logreport(self, report):
-        found = report.duration if report.outcome != "failed" else float("inf")
+        found = report.duration if report.outcome == "passed" else float("inf")
         seconds[report.nodeid] = found + (seconds.get(report.nodeid, 0) if report.when != "setup" else 0)
 
 def late(*_):
-    raise TimeoutError("a slow test")
+    pytest.skip("slow")
 
 for line in sys.stdin:
     how, limit, most, arguments, files = json.loads(line)
@@ -123,9 +118,11 @@ for line in sys.stdin:
         os.dup2(said, 1)
         os.dup2(said, 2)
         if how != "here":
-            signal.signal(signal.SIGPROF, signal.SIG_DFL)
-            signal.setitimer(signal.ITIMER_PROF, limit)
-        status = sys.modules["pytest"].main(arguments, [Ordered(how, most)]) if not files or change(*files) else 99
+            signal.signal(signal.SIGVTALRM, signal.SIG_DFL)
+            signal.setitimer(signal.ITIMER_VIRTUAL, limit)
+        if files:
+            change(*files)
+        status = pytest.main(arguments, [Ordered(how, most)])
         sys.stdout.flush()
         if how != "here":
             os._exit(status)
@@ -258,7 +255,7 @@ class Tester:
     What it had kept of the unchanged code it keeps: that no test fails there says nothing.
     """
 
-    def __init__(self, work: Path, live: bool):
+    def __init__(self, work: Path, live: bool, common: Counter[str]):
         cache = work / "cache"
         environment = os.environ | {
             "PYTHONPATH": str(work / "tree"), "FDI_GYM_CACHE_DIR": str(cache), "PYTHONPYCACHEPREFIX": str(cache / "pyc"),
@@ -266,7 +263,7 @@ class Tester:
         }  # fmt: skip
         self.work, self.said, self.live = work, work / f"said-{live}.txt", live
         self.seconds, self.warm = work / "seconds.json", dict[str, float]()
-        self.passed: dict[str, bool] = {}
+        self.passed, self.common = dict[str, bool](), common
         command = [sys.executable, "-c", FORKS, str(self.said), str(self.seconds)]
         self.process: Any = subprocess.Popen(
             command, cwd=work / "tree", env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -277,15 +274,16 @@ class Tester:
         file, _, chosen = tests.partition(" -k ")
         arguments = ["-q", "--no-header", "--tb=no", "-p", "no:cacheprovider", "-p", "no:xdist", "-rfE",
                      *([file] if "::" in file else file.split()),
-                     *(["-k", chosen] if chosen else []), *(["-x"] if how == "fork" else [])]  # fmt: skip
+                     *(["-k", chosen] if chosen else []), *(["-x"] if how == "fork" else []),
+                     *(["--collect-only"] if how == "here" and self.common[tests] < OFTEN else [])]  # fmt: skip
         request = [how, LIMIT, SLOW, arguments, [str(file) for file in files]]
         self.process.stdin.write(msgspec.json.encode(request).decode() + "\n")
         self.process.stdin.flush()
         status, said = int(self.process.stdout.readline()), self.said.read_text()
-        if status in (0, 5, 99):  # 5: there are none
+        if status in (0, 5):  # 5: there are none
             return ""
         failed = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", said, re.MULTILINE)
-        return failed.group(1) if failed else "time" if status == -signal.SIGPROF else said.strip()[-300:] or "a crash"
+        return failed.group(1) if failed else "time" if status == -signal.SIGVTALRM else said.strip()[-300:] or "a crash"
 
     def passes(self, tests: str) -> bool:
         """Whether tests pass without a change, where they have been run with one."""
@@ -308,8 +306,10 @@ class Tester:
         after = source[: mutant.start] + mutant.after.encode() + source[mutant.stop :]
         changed = self.work / "changed.py"
         changed.write_bytes(after)
+        if self.live and not of_functions(source, after):
+            return ""
         if self.live:
-            sets = sorted(mutant.tests, key=lambda tests: self.warm.get(tests, 0.0 if " -k " in tests else 60.0))
+            sets = sorted(mutant.tests, key=lambda tests: self.common[tests])
         else:
             chosen = [tests for tests in mutant.tests if " -k " in tests]
             sets = [" ".join(tests for tests in mutant.tests if tests not in chosen), *chosen]
@@ -326,6 +326,22 @@ class Tester:
             if by:
                 print(f"{by} fails without any change", flush=True)
         return ""
+
+
+def of_functions(*sources: bytes) -> bool:
+    """Whether two sources differ in functions alone; what modules do at first is done in a live process."""
+
+    def codes(code: types.CodeType) -> Iterator[types.CodeType]:
+        yield code
+        for part in code.co_consts:
+            if isinstance(part, types.CodeType):
+                yield from codes(part)
+
+    def own(code: types.CodeType) -> str:
+        return repr((code.co_code, code.co_names, [c for c in code.co_consts if not isinstance(c, types.CodeType)]))
+
+    pairs = zip(*(codes(compile(source, "", "exec")) for source in sources), strict=True)
+    return all(old.co_flags & 1 for old, new in pairs if own(old) != own(new))
 
 
 def copy_tree(tree: Path, only: str = ".") -> None:
@@ -357,7 +373,8 @@ def run(work: Path, seed: int, count: int, again: bool) -> list[Mutant]:
         copy_tree(work / "drawn")
         mutants = draw(seed, count)
         write_whole(file, msgspec.json.encode(mutants))
-    quick, sure = Tester(work, live=True), Tester(work, live=False)
+    common = Counter(tests for mutant in mutants for tests in mutant.tests)
+    quick, sure = Tester(work, True, common), Tester(work, False, common)
     if again:
         for mutant in mutants:
             mutant.lived, mutant.killed = False, mutant.killed or None
