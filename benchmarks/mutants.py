@@ -38,7 +38,7 @@ from fdi_gym.files import write_whole
 from fdi_gym.tables import markdown
 
 ROOT = Path(__file__).parent.parent
-OFTEN = 20
+OFTEN = 1000
 SLOW, LIMIT = 15.0, 200.0  # core-seconds: a test that takes longer is not run, and tests that take longer have failed
 MUTATED = [
     "fdi_gym/estimation", "fdi_gym/diagnosis", "baselines/filters", "baselines/learned",
@@ -309,10 +309,11 @@ class Tester:
         if self.live and not of_functions(source, after):
             return ""
         if self.live:
-            sets = sorted(mutant.tests, key=lambda tests: self.common[tests])
+            sets = mutant.tests
         else:
             chosen = [tests for tests in mutant.tests if " -k " in tests]
-            sets = [" ".join(tests for tests in mutant.tests if tests not in chosen), *chosen]
+            sets = [joined] if (joined := " ".join(tests for tests in mutant.tests if tests not in chosen)) else []
+            sets += chosen
         for tests in sets:
             self.warmed(tests)
             try:

@@ -325,6 +325,17 @@ def test_a_penalty_per_fault_prefers_fewer_faults():
     assert play(rule, [both] * 15, P)[:9] == [0] * 9
 
 
+@pytest.mark.parametrize("labels", ["single", "dual"])
+def test_the_two_stage_filter_names_most_faults_in_the_end_and_accuses_no_healthy_flight(labels):
+    """Also where pairs of faults are labels, and its decision another: a label must be the same for ten samples."""
+    plant = build("B747Lateral", labels=labels)
+    record = simulate(plant, [draw(plant.process("standard"), 2_500_000 + i) for i in range(40)])
+    last = np.arange(len(record.length)), record.length
+    truth, said = record.label[last], run(make_diagnoser("two_stage_kf", plant), record.obs).label[last]
+    assert (said == truth)[truth > 0].mean() > 0.5
+    assert not said[truth == 0].any()
+
+
 def test_a_flight_longer_than_the_banks_horizon_is_still_diagnosed():
     """Faults that begin after the last flight of the process would have ended are found as the others are."""
     plant = build("B747Lateral")
