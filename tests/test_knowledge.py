@@ -166,6 +166,22 @@ def test_a_disturbance_that_stands_still_may_move_by_a_thousandth_of_its_scale_o
     assert found.d0 == pytest.approx(np.hypot(0.3, floor), rel=1e-7)
 
 
+def test_what_stands_after_a_flights_end_does_not_count(b747):
+    """The spread of a healthy estimate is that of the samples that were flown."""
+    record = fitting.flights_of(b747, "standard", 400_000, 3, False)[1]
+    record = record._replace(obs=5.0 * record.obs[:, :200], length=np.array([60, 150, 199]))
+    other, k = record.obs.copy(), np.arange(200)
+    other[k[None] > record.length[:, None]] *= 2.0
+
+    belief, built = fitting.fit_belief(b747, "standard"), find_diagnoser("augmented_ekf").build
+
+    def excess(obs):
+        return fitting._excess(b747, lambda c: built(b747, belief=belief, calibration=c), record._replace(obs=obs))
+
+    assert np.trace(excess(record.obs)) > 0
+    assert np.array_equal(excess(record.obs), excess(other))
+
+
 def test_flights_of_a_fit_are_validation_flights():
     assert fitting.VALIDATION_SEED == 2_000_000
     assert fitting.VALIDATION_SEED + fitting.FIRST + 100 < 3_000_000
