@@ -8,10 +8,11 @@ that say along which axis, annotations, decorators and messages of errors are le
 drawn in files that numba compiles, since each of those is compiled anew.
 
 The tests are those that name the changed module or the methods it registers, the conformance of these, and those of its
-folder (`AREAS`); those that fail with a change pass without. Functions are changed in a running process first, so that most
-mutants cost seconds; what survives that, and what numba compiles, is run from files. The sources are copied to the work
-folder and stay as they were drawn; the tests are those of the checkout at each start. A run that was killed goes on;
-`--survivors` runs those again that no test killed, for tests written since.
+folder (`AREAS`), the particular ones first; the one that fails with a change passes without. A test that takes long is
+skipped, so a survivor may be one of those that a slow test would kill. Functions are changed in a running process first, so
+that most mutants cost seconds; what lives through that, and what numba compiles, is run from files. The sources are copied
+to the work folder and stay as they were drawn; the tests are those of the checkout at each start. A run that was killed goes
+on; `--survivors` runs those again that no test killed, for tests written since.
 """
 
 import argparse
@@ -38,8 +39,7 @@ from fdi_gym.files import write_whole
 from fdi_gym.tables import markdown
 
 ROOT = Path(__file__).parent.parent
-OFTEN = 1000
-SLOW, LIMIT = 15.0, 200.0  # core-seconds: a test that takes longer is not run, and tests that take longer have failed
+SLOW, LIMIT = 15.0, 200.0  # core-seconds after which a test is skipped, and after which the tests of a file have failed
 MUTATED = [
     "fdi_gym/estimation", "fdi_gym/diagnosis", "baselines/filters", "baselines/learned",
     *(f"fdi_gym/{name}.py" for name in ("metrics", "scores", "intervals", "declaration", "tasks")),
@@ -80,37 +80,21 @@ def change(before, after):
         if isinstance(function, types.FunctionType) and function.__code__ in into:
             function.__code__ = into[function.__code__]
 
-seconds = {}  # of each test that has passed here, by its name; inf: it failed, or took too long
-
-class Ordered:
-    def __init__(self, how, most):
-        self.how, self.most = how, most
-
-    @pytest.hookimpl(trylast=True)
-    def pytest_collection_modifyitems(self, items):
-        taken = {item: seconds.get(item.nodeid, 0) for item in items}
-        items[:] = sorted((item for item in items if taken[item] <= self.most), key=taken.get)
+class Capped:
+    def __init__(self, most):
+        self.most = most
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item):
-        signal.signal(signal.SIGPROF, late)
+        signal.signal(signal.SIGPROF, lambda *_: pytest.skip("slow"))
         signal.setitimer(signal.ITIMER_PROF, self.most)
         try:
             return (yield)
         finally:
             signal.setitimer(signal.ITIMER_PROF, 0)
 
-    def pytest_runtest_logreport(self, report):
-        found = report.duration if report.outcome == "passed" else float("inf")
-        seconds[report.nodeid] = found + (seconds.get(report.nodeid, 0) if report.when != "setup" else 0)
-
-def late(*_):
-    pytest.skip("slow")
-
 for line in sys.stdin:
     how, limit, most, arguments, files = json.loads(line)
-    if os.path.exists(sys.argv[2]):
-        seconds |= json.load(open(sys.argv[2]))
     child = 0 if how == "here" else os.fork()
     if not child:
         kept = os.dup(1)
@@ -122,11 +106,10 @@ for line in sys.stdin:
             signal.setitimer(signal.ITIMER_VIRTUAL, limit)
         if files:
             change(*files)
-        status = pytest.main(arguments, [Ordered(how, most)])
+        status = pytest.main(arguments, [Capped(most)])
         sys.stdout.flush()
         if how != "here":
             os._exit(status)
-        json.dump(seconds, open(sys.argv[2], "w"))
         os.dup2(kept, 1)
     else:
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
@@ -243,39 +226,41 @@ def draw(seed: int, count: int) -> list[Mutant]:
             if 3 * (dear + 1) > count:
                 continue
             dear += 1
-        every[i].tests = tests_of(every[i].file)
         found.append(every[i])
+    areas = {file: tests_of(file) for file in files}
+    common = Counter(tests for area in areas.values() for tests in area)
+    for mutant in found:
+        mutant.tests = sorted(areas[mutant.file], key=lambda tests: common[tests])  # those of few files first
     return sorted(found, key=lambda mutant: (mutant.file in compiled, "learned" in mutant.file))  # the dear ones last
 
 
 class Tester:
     """Runs tests in the tree, each time in a fork of a process that has imported the libraries, and nothing of the tree.
 
-    A live one has run the tests before, so all is imported and built; a change of a function is then made in its memory.
-    What it had kept of the unchanged code it keeps: that no test fails there says nothing.
+    A live one has collected the tests before, so all is imported; a change of a function is then made in its memory. What it
+    had computed with the unchanged code it keeps: that no test fails there says nothing.
     """
 
-    def __init__(self, work: Path, live: bool, common: Counter[str]):
+    def __init__(self, work: Path, live: bool):
         cache = work / "cache"
         environment = os.environ | {
             "PYTHONPATH": str(work / "tree"), "FDI_GYM_CACHE_DIR": str(cache), "PYTHONPYCACHEPREFIX": str(cache / "pyc"),
             "PYTHONDONTWRITEBYTECODE": "", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
         }  # fmt: skip
         self.work, self.said, self.live = work, work / f"said-{live}.txt", live
-        self.seconds, self.warm = work / "seconds.json", dict[str, float]()
-        self.passed, self.common = dict[str, bool](), common
-        command = [sys.executable, "-c", FORKS, str(self.said), str(self.seconds)]
+        self.collected: set[str] = set()
+        self.passed: dict[str, bool] = {}
+        command = [sys.executable, "-c", FORKS, str(self.said)]
         self.process: Any = subprocess.Popen(
             command, cwd=work / "tree", env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
 
     def _run(self, how: str, tests: str, files: Sequence[Path] = ()) -> str:
-        """The first failure of tests that are not slow, quickest first; what takes much longer than ever before fails."""
+        """The first failure of tests that are not slow, in a fork; or, here, collect them only."""
         file, _, chosen = tests.partition(" -k ")
         arguments = ["-q", "--no-header", "--tb=no", "-p", "no:cacheprovider", "-p", "no:xdist", "-rfE",
                      *([file] if "::" in file else file.split()),
-                     *(["-k", chosen] if chosen else []), *(["-x"] if how == "fork" else []),
-                     *(["--collect-only"] if how == "here" and self.common[tests] < OFTEN else [])]  # fmt: skip
+                     *(["-k", chosen] if chosen else []), "-x" if how == "fork" else "--collect-only"]  # fmt: skip
         request = [how, LIMIT, SLOW, arguments, [str(file) for file in files]]
         self.process.stdin.write(msgspec.json.encode(request).decode() + "\n")
         self.process.stdin.flush()
@@ -290,14 +275,6 @@ class Tester:
         if tests not in self.passed:
             self.passed[tests] = not self._run("fork", tests)
         return self.passed[tests]
-
-    def warmed(self, tests: str) -> None:
-        """In a live one: the tests have been run here. Those that fail unchanged are not run again."""
-        if self.live and tests not in self.warm:
-            begun = time.monotonic()
-            by = self._run("here", tests)
-            self.warm[tests] = time.monotonic() - begun
-            print(f"without a change: {tests}: {by or 'passes'}, {self.warm[tests]:.0f} s", flush=True)
 
     def first_failure(self, mutant: Mutant) -> str:
         """The first of a mutant's tests that fails with the change and passes without, or nothing."""
@@ -315,7 +292,9 @@ class Tester:
             sets = [joined] if (joined := " ".join(tests for tests in mutant.tests if tests not in chosen)) else []
             sets += chosen
         for tests in sets:
-            self.warmed(tests)
+            if self.live and tests not in self.collected:
+                self._run("here", tests)
+                self.collected.add(tests)
             try:
                 if not self.live:
                     path.write_bytes(after)
@@ -374,8 +353,7 @@ def run(work: Path, seed: int, count: int, again: bool) -> list[Mutant]:
         copy_tree(work / "drawn")
         mutants = draw(seed, count)
         write_whole(file, msgspec.json.encode(mutants))
-    common = Counter(tests for mutant in mutants for tests in mutant.tests)
-    quick, sure = Tester(work, True, common), Tester(work, False, common)
+    quick, sure = Tester(work, live=True), Tester(work, live=False)
     if again:
         for mutant in mutants:
             mutant.lived, mutant.killed = False, mutant.killed or None
