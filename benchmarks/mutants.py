@@ -285,13 +285,7 @@ class Tester:
         changed.write_bytes(after)
         if self.live and not of_functions(source, after):
             return ""
-        if self.live:
-            sets = mutant.tests
-        else:
-            chosen = [tests for tests in mutant.tests if " -k " in tests]
-            sets = [joined] if (joined := " ".join(tests for tests in mutant.tests if tests not in chosen)) else []
-            sets += chosen
-        for tests in sets:
+        for tests in mutant.tests:
             if self.live and tests not in self.collected:
                 self._run("here", tests)
                 self.collected.add(tests)
