@@ -8,10 +8,11 @@ that say along which axis, annotations, decorators and messages of errors are le
 drawn in files that numba compiles, since each of those is compiled anew.
 
 The tests are those that name the changed module or the methods it registers, the conformance of these, and those of its
-folder (`AREAS`); those that fail with a change pass without. Functions are changed in a running process first, so that most
-mutants cost seconds; what survives that, and what numba compiles, is run from files. The sources are copied to the work
-folder and stay as they were drawn; the tests are those of the checkout at each start. A run that was killed goes on;
-`--survivors` runs those again that no test killed, for tests written since.
+folder (`AREAS`), the particular ones first; the one that fails with a change passes without. A test that takes long is
+skipped, so a survivor may be one of those that a slow test would kill. Functions are changed in a running process first, so
+that most mutants cost seconds; what lives through that, and what numba compiles, is run from files. The sources are copied
+to the work folder and stay as they were drawn; the tests are those of the checkout at each start. A run that was killed goes
+on; `--survivors` runs those again that no test killed, for tests written since.
 """
 
 import argparse
@@ -24,6 +25,8 @@ import signal
 import subprocess
 import sys
 import time
+import types
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,6 +39,7 @@ from fdi_gym.files import write_whole
 from fdi_gym.tables import markdown
 
 ROOT = Path(__file__).parent.parent
+SLOW, LIMIT = 15.0, 200.0  # core-seconds after which a test is skipped, and after which the tests of a file have failed
 MUTATED = [
     "fdi_gym/estimation", "fdi_gym/diagnosis", "baselines/filters", "baselines/learned",
     *(f"fdi_gym/{name}.py" for name in ("metrics", "scores", "intervals", "declaration", "tasks")),
@@ -61,6 +65,7 @@ import gc, importlib, json, os, signal, sys, types
 for name in ("gymnasium", "hypothesis", "joblib", "msgspec", "numba", "pytest", "scipy.linalg", "scipy.special",
              "scipy.stats", "stable_baselines3", "torch", "tqdm", "tyro"):
     importlib.import_module(name)
+import pytest
 
 def codes(code):
     yield code
@@ -68,30 +73,40 @@ def codes(code):
         if isinstance(part, types.CodeType):
             yield from codes(part)
 
-def own(code):
-    return code.co_code, code.co_names, [c for c in code.co_consts if not isinstance(c, types.CodeType)]
-
 def change(before, after):
     pairs = list(zip(*(codes(compile(open(file).read(), before, "exec")) for file in (before, after)), strict=True))
-    if not all(old.co_flags & 1 for old, new in pairs if repr(own(old)) != repr(own(new))):
-        return False  # of a module's or class's own code, which has run
     into = {old: new for old, new in pairs if old != new}
     for function in gc.get_objects():
         if isinstance(function, types.FunctionType) and function.__code__ in into:
             function.__code__ = into[function.__code__]
-    return True
+
+class Capped:
+    def __init__(self, most):
+        self.most = most
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item):
+        signal.signal(signal.SIGPROF, lambda *_: pytest.skip("slow"))
+        signal.setitimer(signal.ITIMER_PROF, self.most)
+        try:
+            return (yield)
+        finally:
+            signal.setitimer(signal.ITIMER_PROF, 0)
 
 for line in sys.stdin:
-    how, limit, arguments, files = json.loads(line)
+    how, limit, most, arguments, files = json.loads(line)
     child = 0 if how == "here" else os.fork()
     if not child:
         kept = os.dup(1)
         said = os.open(sys.argv[1], os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
         os.dup2(said, 1)
         os.dup2(said, 2)
-        signal.alarm(limit)
-        status = sys.modules["pytest"].main(arguments) if not files or change(*files) else 99
-        signal.alarm(0)
+        if how != "here":
+            signal.signal(signal.SIGVTALRM, signal.SIG_DFL)
+            signal.setitimer(signal.ITIMER_VIRTUAL, limit)
+        if files:
+            change(*files)
+        status = pytest.main(arguments, [Capped(most)])
         sys.stdout.flush()
         if how != "here":
             os._exit(status)
@@ -112,6 +127,7 @@ class Mutant(msgspec.Struct):
     start: int  # of the text that changes, in bytes
     stop: int
     tests: list[str] = []
+    lived: bool = False  # in the running process
     killed: bool | None = None  # None: not run yet
     by: str = ""
     seconds: float = 0.0
@@ -210,16 +226,19 @@ def draw(seed: int, count: int) -> list[Mutant]:
             if 3 * (dear + 1) > count:
                 continue
             dear += 1
-        every[i].tests = tests_of(every[i].file)
         found.append(every[i])
+    areas = {file: tests_of(file) for file in files}
+    common = Counter(tests for area in areas.values() for tests in area)
+    for mutant in found:
+        mutant.tests = sorted(areas[mutant.file], key=lambda tests: common[tests])  # those of few files first
     return sorted(found, key=lambda mutant: (mutant.file in compiled, "learned" in mutant.file))  # the dear ones last
 
 
 class Tester:
     """Runs tests in the tree, each time in a fork of a process that has imported the libraries, and nothing of the tree.
 
-    A live one has run the tests before, so all is imported and built; a change of a function is then made in its memory.
-    What it had kept of the unchanged code it keeps: that no test fails there says nothing.
+    A live one has collected the tests before, so all is imported; a change of a function is then made in its memory. What it
+    had computed with the unchanged code it keeps: that no test fails there says nothing.
     """
 
     def __init__(self, work: Path, live: bool):
@@ -229,52 +248,74 @@ class Tester:
             "PYTHONDONTWRITEBYTECODE": "", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
         }  # fmt: skip
         self.work, self.said, self.live = work, work / f"said-{live}.txt", live
+        self.collected: set[str] = set()
         self.passed: dict[str, bool] = {}
         command = [sys.executable, "-c", FORKS, str(self.said)]
         self.process: Any = subprocess.Popen(
             command, cwd=work / "tree", env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
 
-    def _run(self, how: str, tests: str, limit: float, files: Sequence[Path] = ()) -> str:
+    def _run(self, how: str, tests: str, files: Sequence[Path] = ()) -> str:
+        """The first failure of tests that are not slow, in a fork; or, here, collect them only."""
         file, _, chosen = tests.partition(" -k ")
-        arguments = ["-x", "-q", "--no-header", "--tb=no", "-p", "no:cacheprovider", "-p", "no:xdist", "-rfE", file,
-                     *(["-k", chosen] if chosen else [])]  # fmt: skip
-        request = [how, round(limit), arguments, [str(file) for file in files]]
+        arguments = ["-q", "--no-header", "--tb=no", "-p", "no:cacheprovider", "-p", "no:xdist", "-rfE",
+                     *([file] if "::" in file else file.split()),
+                     *(["-k", chosen] if chosen else []), "-x" if how == "fork" else "--collect-only"]  # fmt: skip
+        request = [how, LIMIT, SLOW, arguments, [str(file) for file in files]]
         self.process.stdin.write(msgspec.json.encode(request).decode() + "\n")
         self.process.stdin.flush()
         status, said = int(self.process.stdout.readline()), self.said.read_text()
-        if status in (0, 5, 99):  # 5: there are none
+        if status in (0, 5):  # 5: there are none
             return ""
-        failed = re.search(r"^(?:FAILED|ERROR) (\S+)", said, re.MULTILINE)
-        return failed.group(1) if failed else "time" if status == -signal.SIGALRM else said.strip()[-300:] or "a crash"
+        failed = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", said, re.MULTILINE)
+        return failed.group(1) if failed else "time" if status == -signal.SIGVTALRM else said.strip()[-300:] or "a crash"
 
     def passes(self, tests: str) -> bool:
-        """Whether tests pass without a change, where they will be run with one."""
+        """Whether tests pass without a change, where they have been run with one."""
         if tests not in self.passed:
-            by = self._run("here", tests, 3600) if self.live else ""
-            by = by or self._run("fork", tests, 3600)
-            self.passed[tests] = not by
-            print(f"without a change: {tests}: {by or 'passes'}", flush=True)
+            self.passed[tests] = not self._run("fork", tests)
         return self.passed[tests]
 
-    def first_failure(self, mutant: Mutant, tests: str) -> str:
-        """The first of some tests that fails with a change, or nothing."""
+    def first_failure(self, mutant: Mutant) -> str:
+        """The first of a mutant's tests that fails with the change and passes without, or nothing."""
         drawn, path = self.work / "drawn" / mutant.file, self.work / "tree" / mutant.file
         source = drawn.read_bytes()
         after = source[: mutant.start] + mutant.after.encode() + source[mutant.stop :]
-        limit = 900 if self.live else 1800
-        if self.live:
-            changed = self.work / "changed.py"
-            changed.write_bytes(after)
-            return self._run("fork", tests, limit, (path, changed)) if self.passes(tests) else ""
-        try:
-            path.write_bytes(after)
-            by = self._run("fork", tests, limit)
-        finally:
-            copy_file(drawn, path)
-        if by and not self.passes(tests):
-            raise SystemExit(f"{tests} fail without any change")
-        return by
+        changed = self.work / "changed.py"
+        changed.write_bytes(after)
+        if self.live and not of_functions(source, after):
+            return ""
+        for tests in mutant.tests:
+            if self.live and tests not in self.collected:
+                self._run("here", tests)
+                self.collected.add(tests)
+            try:
+                if not self.live:
+                    path.write_bytes(after)
+                by = self._run("fork", tests, (path, changed) if self.live else ())
+            finally:
+                copy_file(drawn, path)
+            if by and self.passes(by if by.startswith("tests/") else tests):
+                return by
+            if by:
+                print(f"{by} fails without any change", flush=True)
+        return ""
+
+
+def of_functions(*sources: bytes) -> bool:
+    """Whether two sources differ in functions alone; what modules do at first is done in a live process."""
+
+    def codes(code: types.CodeType) -> Iterator[types.CodeType]:
+        yield code
+        for part in code.co_consts:
+            if isinstance(part, types.CodeType):
+                yield from codes(part)
+
+    def own(code: types.CodeType) -> str:
+        return repr((code.co_code, code.co_names, [c for c in code.co_consts if not isinstance(c, types.CodeType)]))
+
+    pairs = zip(*(codes(compile(source, "", "exec")) for source in sources), strict=True)
+    return all(old.co_flags & 1 for old, new in pairs if own(old) != own(new))
 
 
 def copy_tree(tree: Path, only: str = ".") -> None:
@@ -307,16 +348,22 @@ def run(work: Path, seed: int, count: int, again: bool) -> list[Mutant]:
         mutants = draw(seed, count)
         write_whole(file, msgspec.json.encode(mutants))
     quick, sure = Tester(work, live=True), Tester(work, live=False)
-    for i, mutant in enumerate(mutants):
-        if mutant.killed or (mutant.killed is False and not again):
-            continue
-        begun, compiled = time.monotonic(), is_compiled(work / "drawn" / mutant.file)
-        tries = ((tester, tests) for tester in ((sure,) if compiled else (quick, sure)) for tests in mutant.tests)
-        mutant.by = next((by for tester, tests in tries if (by := tester.first_failure(mutant, tests))), "")
-        mutant.killed, mutant.seconds = bool(mutant.by), time.monotonic() - begun
-        write_whole(file, msgspec.json.encode(mutants))
-        print(i, mutant.file, mutant.line, mutant.before[:60], "->", mutant.after[:60], mutant.by or "SURVIVED",
-              f"{mutant.seconds:.0f} s", flush=True)  # fmt: skip
+    if again:
+        for mutant in mutants:
+            mutant.lived, mutant.killed = False, mutant.killed or None
+    for tester in (quick, sure):
+        for i, mutant in enumerate(mutants):
+            compiled = is_compiled(work / "drawn" / mutant.file)
+            if mutant.killed is not None or (tester is quick and (compiled or mutant.lived)):
+                continue
+            begun = time.monotonic()
+            mutant.by = tester.first_failure(mutant)
+            mutant.killed, mutant.lived = bool(mutant.by) or (None if tester is quick else False), not mutant.by
+            mutant.seconds += time.monotonic() - begun
+            write_whole(file, msgspec.json.encode(mutants))
+            became = mutant.by or ("lives" if tester is quick else "SURVIVED")
+            print(i, mutant.file, mutant.line, mutant.before[:60], "->", mutant.after[:60], became,
+                  f"{mutant.seconds:.0f} s", flush=True)  # fmt: skip
     return mutants
 
 

@@ -7,6 +7,7 @@ from scipy.integrate import quad
 from scipy.stats import chi2
 
 from baselines.filters import augmented_kf, friedland_kf, kalman_filter, two_stage_kf
+from baselines.filters import switching_bayes_bank as switching
 from baselines.filters.bayes_bank import log_mean_exp
 from baselines.filters.windowed_nis import chi_square_quantile
 from fdi_gym.diagnosis import Diagnosis, NotApplicableError, make_diagnoser, run
@@ -323,6 +324,43 @@ def test_a_penalty_per_fault_prefers_fewer_faults():
     assert play(rule, [single] * 15, P)[-1] == plant.label_of(frozenset({"rudder LOE"}))
     assert play(rule, [both] * 15, P)[-1] == plant.label_of(frozenset({"aileron LOE", "rudder stuck"}))
     assert play(rule, [both] * 15, P)[:9] == [0] * 9
+
+
+@pytest.mark.parametrize("labels", ["single", "dual"])
+def test_the_two_stage_filter_names_most_faults_in_the_end_and_accuses_no_healthy_flight(labels):
+    """Also where pairs of faults are labels, and its decision another: a label must be the same for ten samples."""
+    plant = build("B747Lateral", labels=labels)
+    record = simulate(plant, [draw(plant.process("standard"), 2_500_000 + i) for i in range(40)])
+    last = np.arange(len(record.length)), record.length
+    truth, said = record.label[last], run(make_diagnoser("two_stage_kf", plant), record.obs).label[last]
+    assert (said == truth)[truth > 0].mean() > 0.5
+    assert not said[truth == 0].any()
+
+
+def test_the_switching_banks_hypotheses_begin_with_each_period_and_are_healthy_or_end_in_time():
+    for k in range(1, 1200):
+        now = switching.latest(k)
+        assert len(now.begun) <= switching.MOST
+        if k <= switching.START:
+            assert not now.begun.size
+            continue
+        assert now.begun.max() == (k - 1) // switching.GRID * switching.GRID
+        age, ago = k - now.begun[now.ended < 0], k - now.ended[now.ended >= 0]
+        assert age.max() <= switching.LONGEST + switching.GRID
+        assert (ago <= switching.MERGE_AFTER + switching.GRID).all()
+
+
+def test_the_switching_bank_is_the_better_one_where_faults_come_and_go():
+    """Faults that end: it says so, and finds the next; the other bank, of faults that stay, does neither."""
+    plant = build("B747Lateral")
+    record = simulate(plant, [draw(plant.process("hard"), 2_600_000 + i) for i in range(12)])
+    valid = np.arange(record.obs.shape[1]) <= record.length[:, None]
+    right = {
+        name: np.mean([(said == record.label)[valid & (record.label == label)].mean() for label in range(5)])
+        for name in ("switching_bayes_bank", "bayes_bank")
+        for said in [run(make_diagnoser(name, plant), record.obs).label]
+    }
+    assert right["switching_bayes_bank"] > right["bayes_bank"] + 0.1
 
 
 def test_a_flight_longer_than_the_banks_horizon_is_still_diagnosed():

@@ -34,6 +34,16 @@ def test_a_wrong_declaration_is_refused():
             dataclasses.replace(plant, outputs=outputs)
 
 
+@pytest.mark.parametrize("signs", [True, False])
+@pytest.mark.parametrize("turns", [True, False])
+def test_one_kind_of_equivalent_is_enough(signs, turns):
+    """A plant that declares only quaternions, or only periods, has its measurements put right too."""
+    plant = load_plant("CMGSatellite")
+    outputs = plant.outputs if turns else tuple(s._replace(period=0.0) for s in plant.outputs)
+    plant = dataclasses.replace(plant, outputs=outputs, quaternions=plant.quaternions if signs else ())
+    assert has_equivalents(plant) == (signs or turns)
+
+
 # -- the rule
 
 

@@ -1,6 +1,7 @@
 """Suites and their evaluation: frozen, resumable, the same on any number of blocks and workers."""
 
 import csv
+import importlib
 import json
 import re
 from pathlib import Path
@@ -105,6 +106,25 @@ def test_within_a_block_the_quickest_method_comes_first_and_in_the_last_the_slow
 
 
 # -- suites
+
+
+def heirs(of):
+    """All classes that are made of one."""
+    for found in of.__subclasses__():
+        yield found
+        yield from heirs(found)
+
+
+def test_no_structure_takes_a_field_that_it_does_not_know_and_none_is_changed_once_read():
+    """A misspelt field is refused. What users write themselves, options and the shapes of plants, may be changed."""
+    for file in [*ROOT.glob("fdi_gym/**/*.py"), *ROOT.glob("baselines/**/*.py")]:
+        if "(msgspec.Struct" in file.read_text():
+            importlib.import_module(".".join(file.relative_to(ROOT).with_suffix("").parts))
+    written = ("fdi_gym.options", "fdi_gym.shapes", "fdi_gym.plants.")
+    found = [each for each in heirs(msgspec.Struct) if each.__module__.startswith(("fdi_gym.", "baselines."))]
+    assert {"Row", "Outcome", "Belief", "Calibration", "Card", "Mapping"} <= {each.__name__ for each in found}
+    assert not [each for each in found if not each.__struct_config__.forbid_unknown_fields]
+    assert not [each for each in found if not each.__struct_config__.frozen and not each.__module__.startswith(written)]
 
 
 def test_a_frozen_suite_cannot_be_edited(small, tmp_path):

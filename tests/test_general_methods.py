@@ -106,6 +106,15 @@ def test_mixing_keeps_the_mixture(plant):
     assert np.linalg.eigvalsh(P / np.outer(models.model.scale, models.model.scale)).min() > -1e-9
 
 
+def test_a_model_is_left_as_often_as_the_process_changes(plant):
+    """And for each of the others alike."""
+    belief = belief_of(plant)
+    transition = multiple_model.hypotheses(plant, belief).transition
+    assert transition.sum(axis=1) == pytest.approx(1.0)
+    assert 1.0 - np.diag(transition) == pytest.approx(belief.changes)
+    assert np.ptp(transition[~np.eye(len(transition), dtype=bool)]) == 0.0
+
+
 def test_bank_without_changes_is_bayes_over_single_filters(b747):
     """With no exchange between the models, the probabilities are those of independent filters' likelihoods."""
     models = multiple_model.hypotheses(b747, belief_of(b747))

@@ -12,6 +12,7 @@ from fdi_gym.diagnosis import NotApplicableError, conforming, diagnosers, find_d
 from fdi_gym.diagnosis.knowledge import Fits, fits_file, write_fits
 from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.data import alike, digest
+from fdi_gym.faults import draw
 from fdi_gym.suite import load_suite, suite_names
 
 SUITES = list(suite_names())
@@ -155,6 +156,30 @@ def test_a_belief_is_near_what_the_data_sheet_declares():
             assert (belief.z_walk > 0).all()
             assert (belief.z_walk < 10 * belief.z_size).all(), key
             assert 0 <= belief.changes < 0.1
+
+
+def test_a_disturbance_that_stands_still_may_move_by_a_thousandth_of_its_scale_over_a_flight(b747):
+    steady = dataclasses.replace(b747, disturbance=lambda s: np.full((s.steps + 1, len(b747.disturbances)), 0.3))
+    found, steps = fitting.fit_belief(steady, "standard"), draw(b747.process("standard"), 0).steps
+    floor = 1e-3 * b747.disturbances[0].scale
+    assert found.d_walk == pytest.approx(floor / np.sqrt(steps))
+    assert found.d0 == pytest.approx(np.hypot(0.3, floor), rel=1e-7)
+
+
+def test_what_stands_after_a_flights_end_does_not_count(b747):
+    """The spread of a healthy estimate is that of the samples that were flown."""
+    record = fitting.flights_of(b747, "standard", 400_000, 3, False)[1]
+    record = record._replace(obs=5.0 * record.obs[:, :200], length=np.array([60, 150, 199]))
+    other, k = record.obs.copy(), np.arange(200)
+    other[k[None] > record.length[:, None]] *= 2.0
+
+    belief, built = fitting.fit_belief(b747, "standard"), find_diagnoser("augmented_ekf").build
+
+    def excess(obs):
+        return fitting._excess(b747, lambda c: built(b747, belief=belief, calibration=c), record._replace(obs=obs))
+
+    assert np.trace(excess(record.obs)) > 0
+    assert np.array_equal(excess(record.obs), excess(other))
 
 
 def test_flights_of_a_fit_are_validation_flights():

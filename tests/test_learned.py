@@ -405,10 +405,33 @@ def test_every_recipe_trains_on_training_seeds(tiny, monkeypatch):
     assert drawn
     assert all(first <= seed <= last for seed in drawn)
     assert first >= TRAINING > CALIBRATION > VALIDATION > TEST
+    drawn.clear()
+    training.held_out(CALIBRATION)
+    assert [min(drawn), max(drawn)] == weights.read_card(tiny).seeds["calibration"]
 
 
 # ---------------------------------------------------------------------------------------------------------------
 # Weights
+
+
+@pytest.mark.parametrize("plant_id", PLANTS)
+def test_every_number_of_a_recipe_is_positive_or_nothing(plant_id):
+    plant = build(plant_id)
+    for recipe in (recipes.sequence_recipe(plant), recipes.policy_recipe(plant, "isolation")):
+        for field in dataclasses.fields(recipe):
+            value = getattr(recipe, field.name)
+            for number in dataclasses.astuple(value) if dataclasses.is_dataclass(value) else [value]:
+                assert not isinstance(number, int | float) or number >= 0, field.name
+    assert recipes.sequence_recipe(plant).passes > 0
+
+
+@pytest.mark.parametrize(
+    ("options", "budget", "seed", "rest"),
+    [({}, None, 0, ""), ({"labels": "dual"}, 9, 3, " --options labels dual --budget 9 --seed 3")],
+)
+def test_the_command_that_makes_weights_again_says_what_is_not_as_usual(options, budget, seed, rest):
+    plant = build("B747Lateral", **options)
+    assert weights.command("sequence_net", plant, budget, seed) == f"fdi-gym train sequence_net B747Lateral{rest}"
 
 
 def altered(path, folder, change=None, edit=None):

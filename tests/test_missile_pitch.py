@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 from baselines.filters import missile_model as model
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import no_noise, simulate
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.faults import FaultScenario, draw
 from fdi_gym.plants import missile_pitch as missile
 
@@ -256,6 +257,55 @@ def test_slopes_and_regressors_are_derivatives():
     for label in (1, 2):
         d = difference(lambda a, label=label: model.fault_function(label, a, delta, jet, mach)[0][..., 1])
         assert_allclose(model.fault_slope(label, alpha, mach), d, rtol=1e-6, atol=1e-6)
+
+
+def near(rng, n=2000):
+    """Points alpha, q, where the estimators may be, how far off at most, points that are within that; and what is known."""
+    a, spread = np.column_stack([rng.uniform(-0.3, 0.3, n), rng.uniform(-1, 1, n)]), rng.uniform(0.0, 0.04, (n, 2))
+    x = np.clip(
+        a + spread * rng.choice([-1.0, 1.0, *rng.uniform(-1, 1, 2)], (n, 2)), [-20 * DEG, -np.inf], [20 * DEG, np.inf]
+    )
+    delta, mach = rng.uniform(-0.3, 0.3, n), rng.uniform(1.5, 3, n)
+    return a, spread, x, model.Known(delta, rng.uniform(-0.2, 0.2, n), mach, np.zeros(n, bool), np.zeros(n))
+
+
+def test_an_error_grows_no_faster_than_its_bound():
+    """Through the model's slope and errors of the coefficients, and where actuators do not report through those."""
+    rng = np.random.default_rng(8)
+    a, spread, x, known = near(rng)
+    apart = np.abs(model.xi(*x.T, *known[:3]) - model.xi(*a.T, *known[:3]))
+    error = model.uncertainty_bound(x[:, 0], known.mach)
+    bound = model.growth(a[:, 0], spread, known)
+    assert (apart + error <= bound + 1e-12).all()
+    assert (model.growth(x[:, 0], None, known) == error).all()
+    assert ((apart + error) / bound).max(axis=0).min() > 0.9  # and no bound is far off
+    fins, jets = rng.uniform(-missile.DELTA_MAX, missile.DELTA_MAX, (2, len(a))), rng.uniform(-1, 1, (2, len(a)))
+    moved = np.abs(np.subtract(*(model.xi(*x.T, fin, jet, known.mach) for fin, jet in zip(fins, jets, strict=True))))
+    assert (moved <= model.growth(x[:, 0], None, known._replace(held=np.ones(len(a), bool))) - error + 1e-12).all()
+
+
+@pytest.mark.parametrize("label", range(6))
+def test_a_faults_part_of_an_error_grows_no_faster_than_its_bound(label):
+    a, spread, x, known = near(np.random.default_rng(label))
+    size = np.random.default_rng(9).uniform(-1, 1, len(a))
+
+    def fault(alpha):
+        Z, F0 = model.fault_function(label, alpha, known.delta, known.jet, known.mach)
+        return F0 + size[:, None] * Z
+
+    high = model.reach(a[:, 0], spread)[1]
+    bound = model.fault_growth(label, high, np.abs(size), known) * spread[:, :1]
+    assert (np.abs(fault(x[:, 0]) - fault(a[:, 0])) <= bound + 1e-12).all()
+
+
+def test_the_nominal_fin_is_the_one_that_flies(quiet):
+    """Without a fault the angle and the rate that all estimators go by are those of the flight."""
+    record = simulate(quiet, [missile.study().replace(faults=[])])
+    _, u, known = quiet.split(record.obs)
+    now = model.unknown(1)
+    for k in range(1, 500):
+        now = model.known(Interval(np.full(1, k), u[:, k], None, known[:, k]), now)
+        assert_allclose(model.state(np.zeros((1, 2)), now)[0, 2:], record.state[0, k, 2:], rtol=1e-9, atol=1e-9)
 
 
 def test_uncertainty_stays_inside_its_bound_and_follows_its_regressors(plant):

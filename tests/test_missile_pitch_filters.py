@@ -405,6 +405,12 @@ def test_imm_interaction_is_the_moment_matching_of_its_parts():
         assert_allclose(found.P[0, j], covariance, rtol=1e-12, atol=1e-15)
 
 
+def test_no_mode_is_ever_ruled_out(plant, numbered):
+    """However little a mode explains, it keeps the least probability there is, and comes back if it must."""
+    least = [state.filter.mu.min() for state in states(imm.augmented_ekf_imm(plant), numbered[1][:, :900])]
+    assert min(least) == 1e-8
+
+
 def test_mode_transitions_are_a_distribution():
     Pi = imm.transition(0.01 / 1.5)
     assert_allclose(Pi.sum(axis=1), 1.0)

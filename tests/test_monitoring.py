@@ -134,6 +134,15 @@ def test_training_is_reproducible_and_names_its_seeds(method, b747, tmp_path):
     assert said.alarm.shape == (1, 200)
 
 
+def test_health_is_learned_from_healthy_windows_alone(b747, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(monitoring, "labelled", lambda *a: seen.append(labelled(*a)) or seen[-1])
+    _, m = monitor_of(train("pca", b747, budget=4, work=tmp_path))
+    v, label = seen[0]
+    assert 0.2 < (label > 0).mean() < 0.8
+    assert np.allclose(m.mean, v[label == 0].mean(axis=0), rtol=1e-5, atol=1e-6)
+
+
 def test_weights_that_do_not_fit_are_refused(b747, tmp_path):
     path = train("pca", b747, budget=4, work=tmp_path)
     tensors, card = load_file(path), weights.read_card(path)

@@ -1,12 +1,14 @@
 """The dedicated and the generalised scheme: which sensor is inconsistent with the others."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from conftest import build, readings, states
 from test_general_filters import belief_of
 
 from baselines.filters.augmented_gaussian import gaussian_filter
-from baselines.filters.observer_schemes import bank_filter, grouped, instant
+from baselines.filters.observer_schemes import bank_filter, can_be_left_out, grouped, instant
 from fdi_gym.diagnosis import NotApplicableError, make_diagnoser, run
 from fdi_gym.diagnosis.fitting import flights_of
 from fdi_gym.estimation.augmented import augmented
@@ -119,3 +121,17 @@ def test_bad_settings(b747, settings, error):
         make_diagnoser("generalised_observers", b747, **settings)
     with pytest.raises(NotApplicableError, match="two groups"):
         make_diagnoser("generalised_observers", b747, groups=[["beta", "p", "r", "phi"]])
+
+
+def test_a_sensor_is_needed_where_the_others_do_not_see_what_grows_whatever_the_units():
+    """Two states that grow together: their difference says nothing of that, each of them does."""
+    A, C, hears = np.array([[0.6, 0.5], [0.5, 0.6]]), np.array([[1.0, -1.0], [1.0, 0.0]]), ~np.eye(2, dtype=bool)
+    plant = SimpleNamespace(trim_command=np.zeros(1), known=(), measured_disturbance=None)
+    for scale in ([1.0, 1.0], [1.0, 2.0], [1e-3, 50.0]):
+        model = SimpleNamespace(
+            X0=np.zeros(2),
+            scale=np.array(scale),
+            jacobian_f=lambda X, at: (X, A[None]),
+            jacobian_h=lambda X, at: (X, C[None]),
+        )
+        assert can_be_left_out(plant, model, hears).tolist() == [True, False]

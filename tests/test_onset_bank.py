@@ -164,6 +164,14 @@ def test_a_mixture_has_the_mean_and_covariance_of_its_parts():
     assert_allclose(covariance, second - mean[..., :, None] * mean[..., None, :])
 
 
+@pytest.fixture
+def b747_ends():
+    """A bank that takes onsets every ten samples, of a process whose faults last 30 or 45 samples."""
+    plant, effect = build("B747Lateral"), Abrupt("gamma_rudder", -0.5)
+    drawn = [b747(onset=20, effect=effect, end=50)] * 30 + [b747(onset=40, effect=effect, end=85)] * 30 + [b747()] * 40
+    return Bank(plant, fit_belief(plant, "standard"), events_of(plant, drawn), 11, 10)
+
+
 # -- Bayes by brute force
 
 
@@ -240,6 +248,18 @@ def test_it_is_bayes_by_brute_force_where_all_onsets_are_kept():
         found = np.asarray(bank.read(s).probs)[i]
         assert_allclose(found[[0, *events.label]], expected, rtol=1e-5, atol=1e-9)
         assert 0.01 < expected.max() < 1.0 - 1e-6  # the comparison says something
+
+
+def test_events_that_end_give_their_weight_to_health_and_what_was_never_faulty_keeps_its_own(b747_ends):
+    """No weight is lost, and the end of an event makes no flight one without any event so far."""
+    bank, rng = b747_ends, np.random.default_rng(4)
+    s = bank.start(5)
+    log, step = np.log(rng.dirichlet(np.ones(s.log.shape[1]), 5)), np.full(5, 60)
+    s = s._replace(log=log, onset=rng.integers(0, 6, s.onset.shape) * 10.0, first=rng.uniform(0.2, 0.8, 5))
+    after = bank.ended(s, step)
+    assert_allclose(np.exp(after.log).sum(axis=1), 1.0)
+    assert (after.log[:, 0] > log[:, 0]).all()
+    assert_allclose(after.first * np.exp(after.log[:, 0]), s.first * np.exp(log[:, 0]))
 
 
 # -- as a diagnoser

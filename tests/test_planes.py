@@ -6,7 +6,7 @@ import functools
 import numpy as np
 import pytest
 import valve
-from conftest import build
+from conftest import PLANTS, build
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
@@ -196,6 +196,16 @@ def test_a_flag_on_any_channel_of_a_plane_names_it():
     assert Pi[order.index(0), order.index(VALVE)] == 0.01  # a plane is one fault, whatever its channels
     assert Pi[order.index(BOTH), order.index(LEAK)] == 0.1
     assert Pi[order.index(0), order.index(BOTH)] == 0.0
+
+
+@pytest.mark.parametrize("plant_id", PLANTS)
+def test_where_no_fault_is_a_plane_each_label_has_one_row_of_flags(plant_id):
+    """Also that of a stuck surface, which moves two entries of the fault vector along one line."""
+    plant = build(plant_id)
+    inputs = fault_inputs(plant)
+    if all(len(mode.directions) == 1 for mode in plant.modes):
+        for found, expected in zip(flags_of(plant, inputs), channel_sets(plant, inputs), strict=True):
+            assert np.array_equal(found, expected)
 
 
 # ---------------------------------------------------------------------------------------------------------------

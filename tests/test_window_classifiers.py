@@ -97,6 +97,15 @@ def test_ridge_is_the_weighted_least_squares_solution():
     assert np.abs(minirocket.RIDGE / penalties[0, 0] - 1).min() < 1e-6
 
 
+def test_a_constant_in_all_channels_moves_the_levels_that_trees_see_and_nothing_else(b747):
+    """What is seen of spread, trend and correlation is about the mean of its window."""
+    w = np.random.default_rng(0).standard_normal((5, max(trees.LENGTHS), len(b747.observed)))
+    moved = trees.featurise(b747, w + 3.0) - trees.featurise(b747, w)
+    levels = len(b747.observed) * (1 + len(trees.LENGTHS))
+    assert np.allclose(np.sort(moved, axis=1)[:, -levels:], 3.0)
+    assert np.allclose(np.sort(moved, axis=1)[:, :-levels], 0.0)
+
+
 def test_a_stream_is_seen_as_in_training(b747):
     """The features at the end of a stream are those of the last window of the recorded flight."""
     recipe = sequence_recipe(b747)
