@@ -75,9 +75,9 @@ def test_slopes_through_the_filter_are_those_of_finite_differences(plant_id, tol
     X = torch.from_numpy(model.X0 + 0.01 * rng.normal(size=(3, len(model.X0))) * model.scale).requires_grad_()
 
     def value(X, log):
-        stream, total = Stream(model, obs), torch.zeros(())
+        stream, total = Stream(model, obs, STRIDE), torch.zeros(())
         for step in log:
-            X, shown = FilterStep.apply(X, torch.exp(step), stream, STRIDE)
+            X, shown = FilterStep.apply(X, torch.exp(step), stream, layout)
             total = total + (of_shown * shown).sum()
         return total + (of_X * X).sum()
 

@@ -37,10 +37,10 @@ STANDARD = 24  # flights per condition from which the features are standardised
 
 
 class Stream:
-    """The samples of n recorded flights (n, K + 1, n_obs), and the nominal covariance, which no gradient passes."""
+    """The samples of n recorded flights (n, K + 1, n_obs), `stride` a step, and the nominal covariance: no gradient."""
 
-    def __init__(self, model: AugmentedModel, obs: Array):
-        self.model, self.obs, self.k = model, obs, 0
+    def __init__(self, model: AugmentedModel, obs: Array, stride: int):
+        self.model, self.obs, self.stride, self.k = model, obs, stride, 0
         self.P = np.tile(model.P0, (len(obs), 1, 1))
         self.newest = self.before = gain.at_rest(model, len(obs))
 
@@ -77,13 +77,13 @@ class FilterStep(torch.autograd.Function):
     """A step of several samples: X (n, N) and factor (n, rows, m) -> X, and what is shown (n, all of the layout)."""
 
     @staticmethod
-    def forward(ctx: Any, X: Tensor, factor: Tensor, stream: Stream, stride: int) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, X: Tensor, factor: Tensor, stream: Stream, at_end: gain.Layout) -> tuple[Tensor, Tensor]:
         """Run the filter over the next samples of the stream."""
         model, x, before, E = stream.model, X.detach().numpy(), X.detach().numpy(), factor.detach().numpy()
         rows, m, tape = E.shape[1], len(model.R), []
         total = np.zeros((len(x), 3 * m + rows + model.z.stop - model.z.start))
         u = known = None
-        for _ in range(stride):
+        for _ in range(stream.stride):
             at, y, seen = stream.sample()
             jacobian = None
             if stream.k > 1:
@@ -93,19 +93,21 @@ class FilterStep(torch.autograd.Function):
             total = gain.added(model, total, c, E)
             tape.append((jacobian, c))
             x, stream.P, u, known = c.X, c.P, at.u, at.known
-        raw = gain.shown(model, total, x, before, stream.P, stream.newest - stream.before, u, known)
+        raw = gain.shown(model, at_end.sets, total, x, before, stream.P, stream.newest - stream.before, u, known)
         stream.before = stream.newest
-        ctx.tape, ctx.factor, ctx.model, ctx.stride = tape, E, model, stride
+        ctx.tape, ctx.factor, ctx.model, ctx.layout = tape, E, model, at_end
         return torch.from_numpy(x), torch.from_numpy(raw)
 
     @staticmethod
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor, Tensor, None, None]:  # type: ignore[override]
         """The same samples the other way round."""
         model, E, (gX, raw) = ctx.model, ctx.factor, (slope.numpy() for slope in slopes)
-        at, rows, n_x = gain.layout(model, ctx.stride), E.shape[1], model.x.stop
+        at, rows, n_x = ctx.layout, E.shape[1], model.x.stop
         gX, gE = gX.copy(), np.zeros_like(E)
         gX[:, :rows] += raw[:, at.estimate]
         gX[:, :n_x] += raw[:, at.moved]
+        end = ctx.tape[-1][1]
+        gX[:, model.z] += (raw[:, None, at.distance] @ gain.distance_slopes(model, at.sets, end.X, end.P))[:, 0]
         for jacobian, c in reversed(ctx.tape):
             g = gX * c.kept
             whole = g[:, :rows] + raw[:, at.update]  # of factor * K nu
@@ -165,12 +167,12 @@ class GainNetwork(nn.Module):
         told = x[:, 0, -self.processes :].to(kind)
         unit, mean, std = (torch.from_numpy(a) for a in (nominal.layout.unit, nominal.mean, nominal.std))
         reach = torch.from_numpy(gain.reach(model)).to(kind)[:, None]
-        stream = Stream(model, obs)
+        stream = Stream(model, obs, self.stride)
         X, h = torch.from_numpy(np.tile(model.X0, (n, 1))), torch.zeros(n, self.hidden, dtype=kind)
         factor = torch.ones(n, self.rows, self.m, dtype=X.dtype)
         out, estimates, shown = [], [], []
         for _ in range(x.shape[1]):
-            X, raw = FilterStep.apply(X, factor, stream, self.stride)  # type: ignore[misc]
+            X, raw = FilterStep.apply(X, factor, stream, nominal.layout)  # type: ignore[misc]
             own = ((torch.asinh(raw / unit) - mean) / std).clamp(-gain.CLIP, gain.CLIP).to(kind)
             seen = self.seen(torch.cat([own, told], dim=1))
             h = self.memory(seen, h)

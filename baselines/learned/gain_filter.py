@@ -18,8 +18,9 @@ A. Lopez Escoriza, R. J. G. van Sloun, Y. C. Eldar, IEEE Transactions on Signal 
     F4  forward update difference     x_{t|t} - x_{t|t-1}
 
 where t - 1 is the end of the step before and F2 and F4 are summed over the samples of a step. Beside them: the mean square
-of F2, what the nominal gain would have done to z, the estimate, how sure the nominal filter is of z, the newest command and
-known signals, and how many samples of each sensor reported.
+of F2, what the nominal gain would have done to z, the estimate, how sure the nominal filter is of z, how far z is from what
+each label looks like (`fdi_gym.estimation.labels`), the newest command and known signals, and how many samples of each
+sensor reported.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ import numpy as np
 from fdi_gym.estimation import gaussian
 from fdi_gym.estimation.augmented import AugmentedModel
 from fdi_gym.estimation.interval import Interval
+from fdi_gym.estimation.labels import Manifolds, distances, manifolds
 from fdi_gym.plant import Array
 
 RULE = "extended"
@@ -51,25 +53,28 @@ class Layout(NamedTuple):
     moved: slice  # (n_x) F3
     estimate: slice  # (rows) [x; z]
     sure: slice  # (p) log of the nominal standard deviation of z, in units of its typical size
+    distance: slice  # (labels) squared distance of z to each label's set, in the metric of its nominal covariance
     change: slice  # (m) F1
     signals: slice  # (n_u + n_known) the newest command and known signals, scaled
     unit: Array  # (all,)
+    sets: Manifolds  # the labels
 
 
 def layout(model: AugmentedModel, stride: int) -> Layout:
     """The layout for steps of `stride` samples."""
     plant, n_x, p, m = model.plant, model.x.stop, model.z.stop - model.z.start, len(model.R)
-    rows, scale, many = n_x + p, model.scale[: n_x + p], float(stride)
+    rows, scale, many, sets = n_x + p, model.scale[: n_x + p], float(stride), manifolds(plant)
     z_half = np.concatenate([scale[:n_x], 0.5 * scale[n_x:]])
     parts = {
         "white": np.full(m, many**0.5), "energy": np.full(m, many), "update": 0.1 * scale, "score": np.full(p, many**0.5),
         "seen": np.full(m, many), "moved": 0.1 * scale[:n_x], "estimate": z_half, "sure": np.ones(p),
+        "distance": np.ones(1 + len(sets.labels)),
         "change": 2.0 * np.sqrt(np.diag(model.R)), "signals": np.ones(len(plant.commands) + len(plant.known)),
     }  # fmt: skip
     ends = np.cumsum([len(unit) for unit in parts.values()])
     slices = [slice(int(end) - len(unit), int(end)) for end, unit in zip(ends, parts.values(), strict=True)]
     assert rows == len(scale)
-    return Layout(*slices, unit=np.concatenate(list(parts.values())))
+    return Layout(*slices, unit=np.concatenate(list(parts.values())), sets=sets)
 
 
 class Corrected(NamedTuple):
@@ -142,13 +147,22 @@ def added(model: AugmentedModel, total: Array, c: Corrected, factor: Array) -> A
     return total + np.concatenate([white, white**2, update, score, c.seen], axis=1)
 
 
+def distance_slopes(model: AugmentedModel, sets: Manifolds, X: Array, P: Array) -> Array:
+    """Slopes by z (n, labels, p) of the distances: those of the nearest points held, since they are nearest."""
+    z, P = X[:, model.z], P[:, model.z, model.z]
+    off = z[:, None] - np.concatenate([np.zeros((len(z), 1, z.shape[1])), sets.points(distances(z, P, sets).m)], axis=1)
+    return 2.0 * T(np.linalg.solve(P, T(off, (0, 2, 1))), (0, 2, 1))
+
+
 def shown(
-    model: AugmentedModel, total: Array, X: Array, before: Array, P: Array, change: Array, u: Array, known: Array
+    model: AugmentedModel, sets: Manifolds, total: Array, X: Array, before: Array, P: Array, change: Array, u: Array,
+    known: Array,
 ) -> Array:  # fmt: skip
     """What is shown at the end of a step (n, all of the layout), in the layout's order and still without units.
 
     Args:
         model: The model.
+        sets: The labels.
         total: The sums of the step.
         X: Estimate (n, N).
         before: That at the end of the step before (n, N).
@@ -160,7 +174,8 @@ def shown(
     blank = np.zeros((len(X), len(plant.outputs)))
     signals = plant.scale(np.concatenate([blank, u, known], axis=1))[:, len(plant.outputs) :]
     sure = np.log(spread(model, P) / model.scale[model.z])
-    return np.concatenate([total, X[:, :n_x] - before[:, :n_x], X[:, : n_x + p], sure, change, signals], axis=1)
+    J = distances(X[:, model.z], P[:, model.z, model.z], sets).J
+    return np.concatenate([total, X[:, :n_x] - before[:, :n_x], X[:, : n_x + p], sure, J, change, signals], axis=1)
 
 
 def features(raw: Array, unit: Array, mean: Array, std: Array) -> Array:

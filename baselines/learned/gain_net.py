@@ -90,7 +90,7 @@ def tensor_shapes(plant: Plant, tensors: Mapping[str, Array], hidden: int, proce
     n_x, p, magnitudes = len(plant.states), len(plant.estimated), plant.n_magnitudes
     m, q = (np.asarray(tensors.get(BELIEF + name, np.zeros(0))).size for name in ("sensors", "disturbances"))
     rows, labels = n_x + p, len(plant.labels)
-    shown = 4 * m + 2 * rows + 2 * p + n_x + len(plant.commands) + len(plant.known)
+    shown = 4 * m + 2 * rows + 2 * p + n_x + labels + len(plant.commands) + len(plant.known)
     inputs = shown + processes
     layers = {
         "value": (hidden, inputs), "gate": (hidden, inputs), "join": (hidden, inputs + hidden), "read": (hidden, hidden),
@@ -189,7 +189,7 @@ def gain_filter(nominal: Nominal, net: Mapping[str, Array], context: Array, stri
 
     def spoken(s: Filtered, at: Interval) -> Filtered:
         """At the end of a step."""
-        raw = gain.shown(model, s.total, s.X, s.start, s.P, s.newest - s.reported, at.u, at.known)
+        raw = gain.shown(model, nominal.layout.sets, s.total, s.X, s.start, s.P, s.newest - s.reported, at.u, at.known)
         own = gain.features(raw, nominal.layout.unit, nominal.mean, nominal.std)
         x = np.concatenate([own, np.tile(context, (len(own), 1))], axis=1)
         said = forward(net, x, s.said.h, reach, labels)
