@@ -51,7 +51,7 @@ class Stream:
         known, d = now[:, n_y + n_u :], None
         if plant.measured_disturbance is not None:
             earlier = self.obs[:, max(k - 1, 0), n_y + n_u :]
-            d = plant.measured_disturbance((number - 1) * plant.dt, earlier, known)
+            d = plant.measured_disturbance((number - 1) * plant.dt, earlier, known)  # type: ignore[arg-type]
         seen = ~np.isnan(now[:, :n_y])
         y = np.where(seen, now[:, :n_y], 0.0)
         self.newest, self.k = gain.newest(self.model, self.newest, y, seen), k + 1
@@ -82,7 +82,7 @@ class FilterStep(torch.autograd.Function):
         model, x, before, E = stream.model, X.detach().numpy(), X.detach().numpy(), factor.detach().numpy()
         rows, m, tape = E.shape[1], len(model.R), []
         total = np.zeros((len(x), 3 * m + rows + model.z.stop - model.z.start))
-        u = known = None
+        u, known = stream.obs[:, 0, :0], stream.obs[:, 0, :0]
         for _ in range(stream.stride):
             at, y, seen = stream.sample()
             jacobian = None

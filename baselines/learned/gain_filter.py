@@ -103,7 +103,7 @@ def corrected(
     An estimate that is no number begins again; one that is too far off is stopped.
     """
     y, seen = y[:, model.sensors], seen[:, model.sensors]
-    lost = ~(np.isfinite(X).all(axis=1) & np.isfinite(P).all(axis=(1, 2)))
+    lost = np.logical_not(np.isfinite(X).all(axis=1) & np.isfinite(P).all(axis=(1, 2)))
     if lost.any():
         X, P = np.where(lost[:, None], model.X0, X), np.where(lost[:, None, None], model.P0, P)
     if model.H is not None:
