@@ -131,6 +131,7 @@ FILTERS = {  # that residual_net is shown, and training flights per condition: f
 WINDOWS = {"CMGSatellite": {"standard": (3, 0.2), "mixed": (3, 0.1)}}
 GAINS = {  # training flights per condition, and passes, of the network that corrects the gain of a filter
     "B747Lateral": {"flights": 12288, "passes": 2},
+    "ThreeTank": {"flights": 6144, "passes": 2, "validate": 16},
 }
 GENERAL_FILTERS = (("augmented_ekf", "multiple_model_ekf"), 300)
 POLICIES = {  # steps: decisions of a flight, less one
