@@ -48,9 +48,17 @@ TINY = SequenceRecipe(
     flights=16, identify=8, chunk=8, passes=2, validation=4, validate=1, batch=8, hidden=16,
 )  # fmt: skip
 COMMITTED = sorted(weights.WEIGHTS.glob("*.safetensors"))
-LEARNED = ("sequence_net", "residual_net", "randomised_net", "attention_net", "ppo", "ppo_identification")  # networks
+LEARNED = (
+    "sequence_net",
+    "residual_net",
+    "randomised_net",
+    "attention_net",
+    "ppo",
+    "ppo_identification",
+    "gain_net",
+)  # networks
 CLOSED_FORM = ("pca", "dynamic_pca", "cva", "boosted_trees", "random_forest", "minirocket")  # what learns without torch
-NETWORKS = [path for path in COMMITTED if "_net-" in path.stem]
+NETWORKS = [path for path in COMMITTED if "_net-" in path.stem and not path.stem.startswith("gain_net")]
 
 
 def trained(folder, recipe=TINY, plant="B747Lateral", **arguments):

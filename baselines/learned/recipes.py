@@ -129,6 +129,10 @@ FILTERS = {  # that residual_net is shown, and training flights per condition: f
 }
 # fault windows in a flight that networks are shown, and their pace: whole flights are long, and its suites are so too
 WINDOWS = {"CMGSatellite": {"standard": (3, 0.2), "mixed": (3, 0.1)}}
+GAINS = {  # training flights per condition, and passes, of the network that corrects the gain of a filter
+    "B747Lateral": {"flights": 12288, "passes": 2},
+    "ThreeTank": {"flights": 6144, "passes": 2, "validate": 16},
+}
 GENERAL_FILTERS = (("augmented_ekf", "multiple_model_ekf"), 300)
 POLICIES = {  # steps: decisions of a flight, less one
     "B747Lateral": {"steps": 299, "decisions": 600_000, "entropy": 0.003},
@@ -188,6 +192,14 @@ def residual_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
     return replace(
         network_recipe(plant), filters=filters, identify=100, flights=flights, chunk=chunk, passes=20, validate=2, rate=1e-3
     )
+
+
+def gain_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
+    """The recipe of the network that corrects a filter's gain, in steps of one block; arguments as in `sequence_recipe`."""
+    like = sequence_recipe(plant)
+    shape = like.shape._replace(stride=like.shape.period, every=1)
+    found = replace(like, shape=shape, **{"flights": 2048, "passes": 2, **GAINS.get(plant.id, {})})
+    return found if budget is None else replace(found, flights=budget, chunk=min(found.chunk, budget))
 
 
 def policy_recipe(plant: Plant, task: str, budget: int | None = None) -> PolicyRecipe:
