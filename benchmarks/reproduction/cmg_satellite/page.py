@@ -64,13 +64,14 @@ def campaign(found: Found) -> str:
         flights[b[2:4]] += len(found[b.name()]["outcomes"])
     low, high = min(flights.values()), max(flights.values())
     done = f"{low}" if low == high else f"{low} to {high}"
+    onward = f"`{COMMAND} --only table5 --missing` " + ("goes on with it" if len(there) < len(slew) else "measures it")
     return (
         "The source's campaign: 1,500 flights of Table 5's ranges (100 of each of 15 labels), three filters, three noise "
         "levels. "
         f"Measured here, on the slew: {done} flights of 1,500 in each cell ({len(there)} of {len(slew)} blocks, {CAMPAIGN} "
         "a cell). "
-        f"`{COMMAND} --only table5 --missing` goes on with it. Each table says its n; *earlier run* marks what an earlier "
-        "run of this command measured, of the same processes and methods, and what has not been measured again "
+        f"{onward}. Each table says its n; *earlier run* marks what an earlier run of this command measured, of the same "
+        "processes and methods, and what has not been measured again "
         "(`earlier.toml`).\n"
     )
 

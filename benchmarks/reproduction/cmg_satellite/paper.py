@@ -19,6 +19,7 @@ from benchmarks.reproduction.numbered import fly
 from benchmarks.reproduction.pieces import Jobs
 from fdi_gym.diagnosis import Diagnoser, diagnoser_of, make_diagnoser, run
 from fdi_gym.discovery import load_plant
+from fdi_gym.estimation.decision import Reading
 from fdi_gym.plant import Array, Plant
 from fdi_gym.plants import cmg_satellite as cmg
 
@@ -126,8 +127,12 @@ def literal(grid: str, part: int) -> dict[str, Any]:
 def innovations(plant: Plant) -> Diagnoser:
     """The unadapted joint filter, with its innovations to be seen."""
     filter = joint_filter(plant)
-    shown = filter._replace(read=lambda s: filter.read(s)._replace(signals={"nu": s.nu}))
-    return diagnoser_of(plant, shown, threshold_rule(plant, 0.05))
+
+    def shown(s: Any) -> Reading:
+        reading = filter.read(s)
+        return reading._replace(signals={**(reading.signals or {}), "nu": s.nu})
+
+    return diagnoser_of(plant, filter._replace(read=shown), threshold_rule(plant, 0.05))
 
 
 def residual(profile: str, snr: int) -> dict[str, Any]:
