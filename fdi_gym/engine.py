@@ -18,8 +18,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from fdi_gym import closed_loop
-from fdi_gym.closed_loop import FAULTS
+from fdi_gym import closed_loop, effects
 from fdi_gym.faults import FaultScenario
 from fdi_gym.flights import Chunk, Flights
 from fdi_gym.model import contiguous
@@ -103,14 +102,14 @@ def advance(
     slots = np.arange(n) if slots is None else slots
     inputs = _optional("inputs", inputs, (samples, n, n_u))
     references = _optional("references", references, (samples, n, plant.reference_width))
-    sensors = _optional("sensors", sensors, (samples, n, n_y, FAULTS))
-    lags = sensors[..., closed_loop.LAG]
+    sensors = _optional("sensors", sensors, (samples, n, n_y, effects.FAULTS))
+    lags = sensors[..., effects.LAG]
     if lags.size and (lags.min() < 0 or lags.max() > max(flights.history.shape[1] - 1, 0)):
         raise ValueError(
             f"a sensor lags by 0 to {max(flights.history.shape[1] - 1, 0)} samples (longest_lag of the flights)"
         )
     arguments = (
-        *plant.addresses[:5], plant.dt, plant.substeps, int(plant.true_feedback), plant.nominal_theta,
+        *plant.addresses, plant.dt, plant.substeps, int(plant.true_feedback), plant.nominal_theta,
         *flights.signals, *flights.arrays(),
     )  # fmt: skip
 

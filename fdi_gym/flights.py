@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi_gym import closed_loop
+from fdi_gym import effects
 from fdi_gym.bounds import check_bounds
 from fdi_gym.closed_loop import FLYING, OVER, TERMINATED
 from fdi_gym.faults import Abrupt, Effect, FaultScenario, Hold, Incipient, Intermittent, Ramp, Samples, Sampling, Square
@@ -99,8 +99,8 @@ class Flights:
         self.theta, self.p = np.zeros((n, n_theta)), np.zeros((n, len(plant.nominal_p)))
         self.q = np.zeros((n, len(plant.q)))
         self.readings, self.history = np.zeros((n, 2, n_y)), np.zeros((n, longest_lag + 1 if longest_lag else 0, n_y))
-        self.reporting, self.dropped = np.zeros((0, n_y, closed_loop.REPORTING)), np.zeros((0, n_y))
-        self.effects, self.held = np.zeros((n, 1, closed_loop.COLUMNS)), np.zeros((n, 1))
+        self.reporting, self.dropped = np.zeros((0, n_y, effects.REPORTING)), np.zeros((0, n_y))
+        self.effects, self.held = np.zeros((n, 1, effects.COLUMNS)), np.zeros((n, 1))
         self.counts, self.labels = np.zeros(n, np.int64), np.full((n, 2, 2), NEVER)
         self.tables: list[tuple[Any, ...]] = [()] * n  # reference, disturbance, w, v and samples of effects: by address
         self.addresses = np.zeros((4, n), np.int64)
@@ -189,19 +189,19 @@ class Flights:
             for effect in fault.effects:
                 match effect:
                     case Abrupt(value=value):
-                        what = (closed_loop.ABRUPT, value, 0, 0)
+                        what = (effects.ABRUPT, value, 0, 0)
                     case Incipient(value=value, rate=rate):
-                        what = (closed_loop.INCIPIENT, value, rate, 0)
+                        what = (effects.INCIPIENT, value, rate, 0)
                     case Ramp(value=value, duration=duration):
-                        what = (closed_loop.RAMP, value, duration, 0)
+                        what = (effects.RAMP, value, duration, 0)
                     case Intermittent(value=value, period=period, duty=duty):
-                        what = (closed_loop.INTERMITTENT, value, period, duty)
+                        what = (effects.INTERMITTENT, value, period, duty)
                     case Square(value=value, other=other, period=period):
-                        what = (closed_loop.SQUARE, value, period, other)
+                        what = (effects.SQUARE, value, period, other)
                     case Hold(command=command, lag=lag):
-                        what = (closed_loop.HOLD, 0, self._commands[command], lag)
+                        what = (effects.HOLD, 0, self._commands[command], lag)
                     case Samples(values=values):
-                        what = (closed_loop.SAMPLES, 0, len(values), 0)
+                        what = (effects.SAMPLES, 0, len(values), 0)
                         samples[len(rows)] = np.array(values, float)
                 rows.append((self._entries[effect.entry], fault.onset, end, *what))
         if len(rows) > self.effects.shape[1]:
@@ -212,7 +212,7 @@ class Flights:
         if rows:
             self.effects[i, : len(rows)] = rows
             for e, row in enumerate(rows):
-                if row[3] == closed_loop.HOLD:  # the command before sample 0, until another is caught
+                if row[3] == effects.HOLD:  # the command before sample 0, until another is caught
                     self.held[i, e] = plant.trim_command[row[5]]
         return samples
 
@@ -231,9 +231,9 @@ class Flights:
             self.reporting, self.dropped = (np.zeros((len(self), *a.shape[1:])) for a in (self.reporting, self.dropped))
         rows, p = self.reporting[i], said.dropout
         stay = p if said.burst == 1.0 else 1.0 - 1.0 / said.burst
-        rows[:, closed_loop.AGAIN] = said.hold
-        rows[:, closed_loop.BEGIN], rows[:, closed_loop.STAY] = (1.0 - stay) * p / (1.0 - p), stay
-        for column, by_name in ((closed_loop.PERIOD, said.periods), (closed_loop.DELAY, said.delays)):
+        rows[:, effects.AGAIN] = said.hold
+        rows[:, effects.BEGIN], rows[:, effects.STAY] = (1.0 - stay) * p / (1.0 - p), stay
+        for column, by_name in ((effects.PERIOD, said.periods), (effects.DELAY, said.delays)):
             for j, output in enumerate(plant.outputs):
                 rows[j, column] = by_name.get(output.name, 0)
 

@@ -9,6 +9,12 @@ from numba import boolean, float64, int64, void
 from fdi_gym.kernels import M, V, around, compiled, function_at, map_at, stack
 
 
+@numba.njit(inline="always")
+def _copy(table, i, other, j):
+    for a in range(other.shape[1]):
+        other[j, a] = table[i, a]
+
+
 @numba.njit
 def _theta_at(tau, a, b, g, theta):
     for j in range(theta.size):
@@ -83,80 +89,80 @@ FEW = 3  # points from which that is worth it
 
 
 def _lanes_around(sizes: tuple[int, ...], dynamics: Any, project: Any) -> Any:
-    discrete, (n, n_u, n_theta, n_d, n_p) = not sizes[0], sizes[1:]
+    continuous, (n, n_u, n_theta, n_d, n_p) = sizes[0], sizes[1:]
     of_state, of_command, of_theta, of_disturbance, of_p = (stack(size) for size in sizes[1:])
     states, commands, thetas, disturbances, ps, times = (stack(size * LANES) for size in (*sizes[1:], 1))
 
-    def lanes(t, dt, substeps, X, U, THETA, D, P):
+    def lanes(t, dt, substeps, x, u, theta, d, p, out):
         # all on the stack: LLVM then sees that no store of one lane is a load of another, and makes vectors of the loops
         k1, k2, k3, k4, z, now = of_state(), of_state(), of_state(), of_state(), of_state(), of_state()
-        u, theta, d, p = of_command(), of_theta(), of_disturbance(), of_p()
-        x, us, acts, ds, own, ts = states(), commands(), thetas(), disturbances(), ps(), times()
+        u_j, theta_j, d_j, p_j = of_command(), of_theta(), of_disturbance(), of_p()
+        X, U, THETA, D, P, T = states(), commands(), thetas(), disturbances(), ps(), times()  # entry by entry
         for j in range(LANES):
-            ts[j] = t[j]
+            T[j] = t[j]
             for i in range(n):
-                x[i * LANES + j] = X[i, j]
+                X[i * LANES + j] = x[j, i]
             for i in range(n_u):
-                us[i * LANES + j] = U[i, j]
+                U[i * LANES + j] = u[j, i]
             for i in range(n_theta):
-                acts[i * LANES + j] = THETA[i, j]
+                THETA[i * LANES + j] = theta[j, i]
             for i in range(n_d):
-                ds[i * LANES + j] = D[i, j]
+                D[i * LANES + j] = d[j, i]
             for i in range(n_p):
-                own[i * LANES + j] = P[i, j]
+                P[i * LANES + j] = p[j, i]
         h = dt / max(substeps, 1)
         for s in range(max(substeps, 1)):
             tau = s * h
             for j in range(LANES):
                 for i in range(n):
-                    now[i] = x[i * LANES + j]
+                    now[i] = X[i * LANES + j]
                 for i in range(n_u):
-                    u[i] = us[i * LANES + j]
+                    u_j[i] = U[i * LANES + j]
                 for i in range(n_theta):
-                    theta[i] = acts[i * LANES + j]
+                    theta_j[i] = THETA[i * LANES + j]
                 for i in range(n_d):
-                    d[i] = ds[i * LANES + j]
+                    d_j[i] = D[i * LANES + j]
                 for i in range(n_p):
-                    p[i] = own[i * LANES + j]
-                dynamics(ts[j] + tau, now, u, theta, d, p, k1)
-                if discrete:
+                    p_j[i] = P[i * LANES + j]
+                dynamics(T[j] + tau, now, u_j, theta_j, d_j, p_j, k1)
+                if not continuous:
                     for i in range(n):
-                        x[i * LANES + j] = k1[i]
+                        X[i * LANES + j] = k1[i]
                     continue
                 for i in range(n):
                     z[i] = now[i] + 0.5 * h * k1[i]
-                dynamics(ts[j] + tau + 0.5 * h, z, u, theta, d, p, k2)
+                dynamics(T[j] + tau + 0.5 * h, z, u_j, theta_j, d_j, p_j, k2)
                 for i in range(n):
                     z[i] = now[i] + 0.5 * h * k2[i]
-                dynamics(ts[j] + tau + 0.5 * h, z, u, theta, d, p, k3)
+                dynamics(T[j] + tau + 0.5 * h, z, u_j, theta_j, d_j, p_j, k3)
                 for i in range(n):
                     z[i] = now[i] + h * k3[i]
-                dynamics(ts[j] + tau + h, z, u, theta, d, p, k4)
+                dynamics(T[j] + tau + h, z, u_j, theta_j, d_j, p_j, k4)
                 for i in range(n):
-                    x[i * LANES + j] = now[i] + h / 6.0 * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i])
+                    X[i * LANES + j] = now[i] + h / 6.0 * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i])
         for j in range(LANES):
             for i in range(n):
-                now[i] = x[i * LANES + j]
+                now[i] = X[i * LANES + j]
             for i in range(n_theta):
-                theta[i] = acts[i * LANES + j]
-            project(now, theta)
+                theta_j[i] = THETA[i * LANES + j]
+            project(now, theta_j)
             for i in range(n):
-                X[i, j] = now[i]
+                out[j, i] = now[i]
 
     return lanes
 
 
-_LANES = void(V, float64, int64, M, M, M, M, M)
+_LANES = void(V, float64, int64, M, M, M, M, M, M)
 lanes_at = function_at(_LANES)
 
 
-def lanes(discrete: bool, sizes: tuple[int, ...], dynamics: Any, project: Any) -> Any:
+def lanes(continuous: bool, sizes: tuple[int, ...], dynamics: Any, project: Any) -> Any:
     """The kernel that moves LANES points over an interval side by side, to the bits of `interval`; see `lanes_at`.
 
     It is for so many entries of x, u, theta, d and p. Its arguments: t (LANES,), dt, substeps, then x, u, theta, d and p,
-    each (entries, LANES). It moves x on with theta held.
+    a row for each point (of more columns the first count), and `out`, where the states one sample later go. theta is held.
     """
-    return around(_lanes_around, _LANES, dynamics, project, sizes=(int(not discrete), *sizes))
+    return around(_lanes_around, _LANES, dynamics, project, sizes=(int(continuous), *sizes))
 
 
 @compiled(void(int64, int64, float64, int64, V, M, M, M, M, M, M))
@@ -164,45 +170,29 @@ def propagate(interval_address, lanes_address, dt, substeps, t, x, u, theta, d, 
     """out[i] = the state one sample after x[i]; t, u, theta, d, p have m rows that serve M/m consecutive points each."""
     interval, lanes = interval_at(interval_address), lanes_at(lanes_address)
     points, n = x.shape
-    xi, ui, di, pi = np.empty(n), np.empty(u.shape[1]), np.empty(d.shape[1]), np.empty(p.shape[1])
+    T, X, U, THETA = np.empty(LANES), np.empty((LANES, n)), np.empty((LANES, u.shape[1])), np.empty((LANES, theta.shape[1]))
+    D, P = np.empty((LANES, d.shape[1])), np.empty((LANES, p.shape[1]))
     course, theta_now = np.zeros((3, theta.shape[1])), np.empty(theta.shape[1])
-    T, X, U, THETA = np.empty(LANES), np.empty((n, LANES)), np.empty((ui.size, LANES)), np.empty((theta_now.size, LANES))
-    D, P = np.empty((di.size, LANES)), np.empty((pi.size, LANES))
     every_t, every_u, every_theta = points // t.size, points // u.shape[0], points // theta.shape[0]
     every_d, every_p = points // d.shape[0], points // p.shape[0]
-    together = points - points % LANES if points % LANES < FEW else points
-    for first in range(0, together, LANES):
+    for first in range(0, points, LANES):
+        count = min(LANES, points - first)
         for lane in range(LANES):
             i = min(first + lane, points - 1)
             T[lane] = t[i // every_t]
-            for j in range(n):
-                X[j, lane] = x[i, j]
-            for j in range(ui.size):
-                U[j, lane] = u[i // every_u, j]
-            for j in range(theta_now.size):
-                THETA[j, lane] = theta[i // every_theta, j]
-            for j in range(di.size):
-                D[j, lane] = d[i // every_d, j]
-            for j in range(pi.size):
-                P[j, lane] = p[i // every_p, j]
-        lanes(T, dt, substeps, X, U, THETA, D, P)
-        for lane in range(min(LANES, points - first)):
-            for j in range(n):
-                out[first + lane, j] = X[j, lane]
-    for i in range(together, points):
-        for j in range(n):
-            xi[j] = x[i, j]
-        for j in range(ui.size):
-            ui[j] = u[i // every_u, j]
-        for j in range(course.shape[1]):
-            course[0, j] = theta[i // every_theta, j]
-        for j in range(di.size):
-            di[j] = d[i // every_d, j]
-        for j in range(pi.size):
-            pi[j] = p[i // every_p, j]
-        interval(t[i // every_t], dt, substeps, False, xi, ui, course, di, pi, theta_now)
-        for j in range(n):
-            out[i, j] = xi[j]
+            _copy(x, i, X, lane)
+            _copy(u, i // every_u, U, lane)
+            _copy(theta, i // every_theta, THETA, lane)
+            _copy(d, i // every_d, D, lane)
+            _copy(p, i // every_p, P, lane)
+        if count >= FEW:
+            lanes(T, dt, substeps, X, U, THETA, D, P, X)
+        else:
+            for lane in range(count):
+                course[0] = THETA[lane]
+                interval(T[lane], dt, substeps, False, X[lane], U[lane], course, D[lane], P[lane], theta_now)
+        for lane in range(count):
+            _copy(X, lane, out, first + lane)
 
 
 @compiled(void(int64, V, M, M, M, M, M, M))

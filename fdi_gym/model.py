@@ -28,14 +28,14 @@ def contiguous(a: Any) -> Array:
 
 
 class Addresses(NamedTuple):
-    """Where the compiled equations of a plant lie; those that the closed loop calls come first."""
+    """Where the compiled equations of a plant lie, as the closed loop calls them."""
 
     interval: int  # dynamics and project over a sample: `integration.interval`
+    lanes: int  # the same for points side by side: `integration.lanes`
     output: int
     control: int
     known: int
     outside: int
-    dynamics: int
 
 
 class Model:
@@ -96,18 +96,11 @@ class Model:
         own = self.kernels
         if own is None:
             raise NotApplicableError("needs equations; this plant declares channels only")
-
-        interval = integration.interval(len(self.states), self.own_theta, own.dynamics, own.project or kernels.project)
-        others = (getattr(own, role) or getattr(kernels, role) for role in Addresses._fields[1:])
-        return Addresses(*map(kernels.address, (interval, *others)))
-
-    @functools.cached_property
-    def lanes(self) -> int:
-        """Address of `integration.lanes` around its kernels."""
-        from fdi_gym import integration, kernels
-
-        own, sizes = self.kernels, (*self._widths[:2], self.own_theta, *self._widths[3:])
-        return kernels.address(integration.lanes(not self.substeps, sizes, own.dynamics, own.project or kernels.project))
+        moving, (n_x, n_u, _, n_d, n_p) = (own.dynamics, own.project or kernels.project), self._widths
+        interval = integration.interval(n_x, self.own_theta, *moving)
+        lanes = integration.lanes(self.substeps > 0, (n_x, n_u, self.own_theta, n_d, n_p), *moving)
+        others = (getattr(own, role) or getattr(kernels, role) for role in Addresses._fields[2:])
+        return Addresses(*map(kernels.address, (interval, lanes, *others)))
 
     @functools.cached_property
     def tangent(self) -> int:
@@ -162,7 +155,7 @@ class Model:
 
         x = np.asarray(x, float)
         rows = self._rows_of(t, x, u, theta, d, p, len(self.states))
-        integration.propagate(self.addresses.interval, self.lanes, self.dt, self.substeps, *rows)
+        integration.propagate(*self.addresses[:2], self.dt, self.substeps, *rows)
         return rows[-1].reshape(x.shape)
 
     def measure(
@@ -183,11 +176,11 @@ class Model:
 
     def derivative(self, t: Any, x: Array, u: Array, theta: Array | None = None, d: Array | None = None) -> Array:
         """xdot at x (..., n_x); arguments as in `propagate`. For a discrete plant it is the next state."""
-        from fdi_gym import integration
+        from fdi_gym import integration, kernels
 
         x = np.asarray(x, float)
         rows = self._rows_of(t, x, u, theta, d, None, len(self.states))
-        integration.evaluate(self.addresses.dynamics, *rows)
+        integration.evaluate(kernels.address(self.kernels.dynamics), *rows)
         return rows[-1].reshape(x.shape)
 
     @functools.cached_property

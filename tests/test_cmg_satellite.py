@@ -223,7 +223,7 @@ def test_integration_order():
         from fdi_gym import integration
 
         out = np.empty((1, 11))
-        integration.propagate(plant.addresses.interval, plant.lanes, h, substeps, np.zeros(1), x[None], r, F,
+        integration.propagate(*plant.addresses[:2], h, substeps, np.zeros(1), x[None], r, F,
                               np.zeros((1, 0)), plant.nominal_p[None], out)  # fmt: skip
         return out[0]
 

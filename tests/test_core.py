@@ -39,7 +39,7 @@ def test_rk4_is_of_fourth_order(motor):
     for n in steps:
         out = np.empty((1, 2))
         where, u, theta, d = (
-            (motor.addresses.interval, motor.lanes),
+            (motor.addresses.interval, motor.addresses.lanes),
             np.array([[12.0]]),
             np.array([[1.0, 0.5, 0.0]]),
             np.array([[0.02]]),

@@ -14,7 +14,7 @@ import pytest
 from conftest import build
 from scipy import stats
 
-from fdi_gym import closed_loop, noise
+from fdi_gym import effects, noise
 from fdi_gym.engine import advance, no_noise, simulate, white_noise
 from fdi_gym.faults import Abrupt, Fault, Hold, Samples, draw
 from fdi_gym.flights import Chunk, Flights
@@ -249,7 +249,7 @@ def quiet(plant, n=2, steps=60, longest_lag=0):
 @pytest.mark.parametrize("what", ["inputs", "sensors"])
 def test_nothing_added_is_absent_to_the_byte(plant, what):
     n_y, n_u = len(plant.outputs), len(plant.commands)
-    zeros = {"inputs": np.zeros((151, 5, n_u)), "sensors": np.zeros((151, 5, n_y, closed_loop.FAULTS))}[what]
+    zeros = {"inputs": np.zeros((151, 5, n_u)), "sensors": np.zeros((151, 5, n_y, effects.FAULTS))}[what]
     without, with_zeros = Flights(plant, scenarios(plant, 5)), Flights(plant, scenarios(plant, 5))
     equal(advance(without, 151), advance(with_zeros, 151, **{what: zeros}), without)
 
@@ -272,7 +272,7 @@ def test_an_input_is_added_to_the_command_within_its_range(plant):
 
 def faulty_sensor(plant, column, value, at=slice(20, 40), longest_lag=0, flights=None):
     """The readings of sensor 0 of flight 0 with this fault and without; from an open loop's plant they are comparable."""
-    sensors = np.zeros((61, 2, len(plant.outputs), closed_loop.FAULTS))
+    sensors = np.zeros((61, 2, len(plant.outputs), effects.FAULTS))
     sensors[at, 0, 0, column] = value
     made = flights or (lambda: quiet(plant, longest_lag=longest_lag))
     return advance(made(), 61).obs, advance(made(), 61, sensors=sensors).obs
@@ -285,18 +285,18 @@ def open_loop():
 
 
 def test_gain_and_bias_of_a_sensor(open_loop):
-    well, ill = faulty_sensor(open_loop, closed_loop.GAIN, 0.25)
+    well, ill = faulty_sensor(open_loop, effects.GAIN, 0.25)
     expected = well.copy()
     expected[20:40, 0, 0] *= 1.25
     assert ill == pytest.approx(expected, rel=1e-14)
-    well, ill = faulty_sensor(open_loop, closed_loop.BIAS, -0.5)
+    well, ill = faulty_sensor(open_loop, effects.BIAS, -0.5)
     expected = well.copy()
     expected[20:40, 0, 0] -= 0.5
     assert ill == pytest.approx(expected, rel=1e-14)
 
 
 def test_a_reading_stays_in_the_sensors_range(plant):
-    _, ill = faulty_sensor(plant, closed_loop.BIAS, 1e9)
+    _, ill = faulty_sensor(plant, effects.BIAS, 1e9)
     assert (ill[20:40, 0, 0] == plant.outputs[0].high).all()
 
 
@@ -306,33 +306,33 @@ def test_a_sensors_noise_grows(open_loop):
     drawn = [white_noise(open_loop, rng, 60) for _ in range(2)]
     for w, _ in drawn:
         w[:] = 0
-    well, ill = faulty_sensor(open_loop, closed_loop.NOISE, 2.0, flights=lambda: Flights(open_loop, flown, drawn))
+    well, ill = faulty_sensor(open_loop, effects.NOISE, 2.0, flights=lambda: Flights(open_loop, flown, drawn))
     still = advance(quiet(open_loop), 61).obs
     assert ill[20:40, 0, 0] - still[20:40, 0, 0] == pytest.approx(3 * (well[20:40, 0, 0] - still[20:40, 0, 0]), rel=1e-9)
     assert np.array_equal(np.delete(ill, 0, axis=2), np.delete(well, 0, axis=2))
 
 
 def test_a_frozen_sensor_repeats_its_last_reading(open_loop):
-    well, ill = faulty_sensor(open_loop, closed_loop.FROZEN, 1.0)
+    well, ill = faulty_sensor(open_loop, effects.FROZEN, 1.0)
     expected = well.copy()
     expected[20:40, 0, 0] = well[19, 0, 0]
     assert np.array_equal(ill, expected)
 
 
 def test_a_lagging_sensor_shows_the_past(open_loop):
-    well, ill = faulty_sensor(open_loop, closed_loop.LAG, 4, longest_lag=6)
+    well, ill = faulty_sensor(open_loop, effects.LAG, 4, longest_lag=6)
     expected = well.copy()
     expected[20:40, 0, 0] = well[16:36, 0, 0]
     assert np.array_equal(ill, expected)
     with pytest.raises(ValueError, match="0 to 6"):
-        faulty_sensor(open_loop, closed_loop.LAG, 7, longest_lag=6)
+        faulty_sensor(open_loop, effects.LAG, 7, longest_lag=6)
     with pytest.raises(ValueError, match="0 to 0"):
-        faulty_sensor(open_loop, closed_loop.LAG, 1)
+        faulty_sensor(open_loop, effects.LAG, 1)
 
 
 def test_a_missing_reading_is_nan_and_the_controller_goes_on_with_the_last(plant):
-    _, ill = faulty_sensor(plant, closed_loop.MISSING, 1.0)
-    _, frozen = faulty_sensor(plant, closed_loop.FROZEN, 1.0)
+    _, ill = faulty_sensor(plant, effects.MISSING, 1.0)
+    _, frozen = faulty_sensor(plant, effects.FROZEN, 1.0)
     assert np.isnan(ill[20:40, 0, 0]).all()
     assert np.isnan(ill).sum() == 20
     shown = ~np.isnan(ill)
@@ -342,8 +342,8 @@ def test_a_missing_reading_is_nan_and_the_controller_goes_on_with_the_last(plant
 def test_a_sensors_fault_reaches_the_plant_through_the_controller(plant):
     if plant.id == "B747Lateral":
         plant = build("B747Lateral", variant="bare/closed")
-    sensors = np.zeros((61, 2, len(plant.outputs), closed_loop.FAULTS))
-    sensors[20:, 0, :3, closed_loop.BIAS] = 0.05
+    sensors = np.zeros((61, 2, len(plant.outputs), effects.FAULTS))
+    sensors[20:, 0, :3, effects.BIAS] = 0.05
     well, ill = advance(quiet(plant), 61), advance(quiet(plant), 61, sensors=sensors)
     assert np.array_equal(well.state[:21], ill.state[:21])
     assert not np.allclose(well.state[60, 0], ill.state[60, 0], rtol=1e-9, atol=0)

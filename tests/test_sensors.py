@@ -15,7 +15,7 @@ from conftest import PLANTS, build
 from gymnasium.utils.env_checker import check_env
 from numpy.testing import assert_allclose
 
-from fdi_gym import closed_loop
+from fdi_gym import effects
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import advance, no_noise, simulate
 from fdi_gym.faults import Abrupt, Fault, FaultScenario, Incipient, Intermittent, Ramp, Samples, Sampling, draw
@@ -55,7 +55,7 @@ def fault(sensor, *effects, onset=20, end=40):
 
 
 def test_the_columns_of_the_engine_are_those_of_the_layer():
-    assert [getattr(closed_loop, name.upper()) for name in SENSOR_FAULTS] == list(range(closed_loop.FAULTS))
+    assert [getattr(effects, name.upper()) for name in SENSOR_FAULTS] == list(range(effects.FAULTS))
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -98,7 +98,7 @@ def test_an_effect_is_what_the_table_of_advance_says(sick, column, value):
     """One layer, two ways in: the scenario's effect, and the table that is put in by hand."""
     sensor = sick.outputs[1].name
     scenario = flight(sick, fault(sensor, Abrupt(f"{column}_{sensor}", value)))
-    table = np.zeros((STEPS + 1, 1, len(sick.outputs), closed_loop.FAULTS))
+    table = np.zeros((STEPS + 1, 1, len(sick.outputs), effects.FAULTS))
     table[20:40, 0, 1, SENSOR_FAULTS.index(column)] = value
     said = advance(Flights(sick, [scenario]), STEPS + 1)
     by_hand = advance(Flights(sick.bare, [scenario.without_faults()], longest_lag=8), STEPS + 1, sensors=table)

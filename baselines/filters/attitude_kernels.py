@@ -27,33 +27,29 @@ def predict(lanes_address, dt, substeps, physical, X, P, sign, u, Q, X1, P1, sig
     lanes = lanes_at(lanes_address)
     (n, N), n_theta = X.shape, u.shape[1]
     n_x, count = N - n_theta + 1, 2 * N + 1
-    T, x, us, theta = np.zeros(LANES), np.empty((n_x, LANES)), np.empty((n_theta, LANES)), np.empty((n_theta, LANES))
-    d, p, one = np.empty((0, LANES)), np.empty((physical.size, LANES)), np.empty(n_x)
+    T, x, us, theta = np.zeros(LANES), np.empty((LANES, n_x)), np.empty((LANES, n_theta)), np.empty((LANES, n_theta))
+    d, p = np.empty((LANES, 0)), np.empty((LANES, physical.size))
     U, points, values, first = np.empty((N, N)), np.empty((count, N)), np.empty((count, N)), np.empty((N, N))
     mean, cross, cov = np.empty(N), np.empty((N, N)), np.empty((N, N))
-    for j in range(physical.size):
-        p[j] = physical[j]
+    p[:] = physical
     for e in range(n):
         factor(P[e], U)
         spread(X[e], U, np.sqrt(squared_step(UNSCENTED, N)), points)
-        for j in range(n_theta):
-            us[j] = u[e, j]
+        us[:] = u[e]
         for start in range(0, count, LANES):
             for lane in range(LANES):
                 i = min(start + lane, count - 1)
-                put_back(points[i, : n_x - 1], sign[e], one)
-                for j in range(n_x):
-                    x[j, lane] = one[j]
+                put_back(points[i, : n_x - 1], sign[e], x[lane])
                 for j in range(n_theta):
-                    theta[j, lane] = points[i, n_x - 1 + j]
-            lanes(T, dt, substeps, x, us, theta, d, p)
+                    theta[lane, j] = points[i, n_x - 1 + j]
+            lanes(T, dt, substeps, x, us, theta, d, p, x)
             for lane in range(min(LANES, count - start)):
                 for j in range(n_x - 1):
-                    values[start + lane, j] = x[j if j < 3 else j + 1, lane]
+                    values[start + lane, j] = x[lane, j if j < 3 else j + 1]
                 for j in range(n_x - 1, N):
                     values[start + lane, j] = points[start + lane, j]
             if start == 0:
-                sign1[e] = -1.0 if x[3, 0] < 0.0 else 1.0
+                sign1[e] = -1.0 if x[0, 3] < 0.0 else 1.0
         moments_of_points(UNSCENTED, U, N, values, first, mean, cross, cov)
         for i in range(N):
             X1[e, i] = mean[i]

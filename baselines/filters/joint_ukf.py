@@ -54,7 +54,7 @@ def predicted(plant: Plant, Q: Array, s: Attitude, u: Array) -> Attitude:
     """x (n, 14) one interval later, under the command u: the unscented transform, lambda = 2, with equal weights."""
     x, P, sign = np.empty(s.x.shape), np.empty(s.P.shape), np.empty(len(s.x))
     attitude_kernels.predict(
-        plant.lanes, plant.dt, plant.substeps, plant.nominal_p, contiguous(s.x), contiguous(s.P), s.sign,
+        plant.addresses.lanes, plant.dt, plant.substeps, plant.nominal_p, contiguous(s.x), contiguous(s.P), s.sign,
         contiguous(u), Q, x, P, sign,
     )  # fmt: skip
     return Attitude(x, P, sign)

@@ -91,7 +91,7 @@ def bind(
 
 def _with_addresses(plant: Plant, m: int, constants: tuple[Array, ...], *others: Any) -> Model:
     integers, *rest = constants
-    addresses = plant.addresses.interval, plant.lanes, plant.addresses.output, plant.tangent
+    addresses = plant.addresses.lanes, plant.addresses.output, plant.tangent
     integers = np.concatenate([addresses, integers[ADDRESSES:]])
     return Model(plant, m, (integers, *rest), *others)
 

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from fdi_gym.integration import FEW, LANES, interval_at, lanes_at
+from fdi_gym.integration import LANES, lanes_at
 from fdi_gym.kernels import helper, map_at
 
 EXTENDED, UNSCENTED, CENTRAL_DIFFERENCE = 0, 1, 2
 JITTER, RETRIES = 1e-14, 7  # added to the diagonal where the factorisation fails, times 100 at each retry
-# The integers of a model: four addresses (the last may be 0), sizes, then the lists (entries, disturbances, sensors)
-INTERVAL, OF_LANES, OUTPUT, TANGENT, ADDRESSES = range(5)
-SUBSTEPS, STATES, OUTPUTS, THETA, KNOWN, ENTRIES, DISTURBANCES, SENSORS, OWN, COMMANDS, SIZES = range(4, 15)
+# The integers of a model: three addresses (the last may be 0), sizes, then the lists (entries, disturbances, sensors)
+OF_LANES, OUTPUT, TANGENT, ADDRESSES = range(4)
+SUBSTEPS, STATES, OUTPUTS, THETA, KNOWN, ENTRIES, DISTURBANCES, SENSORS, OWN, COMMANDS, SIZES = range(ADDRESSES, 14)
 
 
 @helper
@@ -45,10 +45,8 @@ def pass_points(moving, integers, reals, offset, direction, t, points, u, known,
     """
     if not moving:
         read_points(integers, reals, offset, direction, t, points, u, known, values)
-    elif points.shape[0] < FEW:
-        move_points(integers, reals, offset, direction, t, points, u, known, values)
     else:
-        move_lanes(integers, reals, offset, direction, t, points, u, known, values)
+        move_points(integers, reals, offset, direction, t, points, u, known, values)
 
 
 @helper
@@ -78,56 +76,31 @@ def read_points(integers, reals, offset, direction, t, points, u, known, values)
 
 @helper
 def move_points(integers, reals, offset, direction, t, points, u, known, values):
-    """The states one sample after the points, one by one."""
-    interval = interval_at(integers[INTERVAL])
-    n_x, p, n_d, own, n_m = integers[STATES], integers[ENTRIES], integers[DISTURBANCES], integers[OWN], direction.shape[1]
-    disturbances, nominal = integers[SIZES + p : SIZES + p + n_d], reals[1:]
-    now, d, x, theta, course = nominal.copy(), known.copy(), np.empty(n_x), np.empty(own), np.zeros((3, own))
-    physical = now[integers[THETA] :]
-    for i in range(points.shape[0]):
-        if other_magnitudes(integers, direction, points, i):
-            put_magnitudes(integers, offset, direction, points[i], nominal, now)
-        for j in range(n_d):
-            d[disturbances[j]] = points[i, n_x + n_m + j]
-        for j in range(n_x):
-            x[j] = points[i, j]
-        for j in range(own):
-            course[0, j] = now[j]
-        interval(t, reals[0], integers[SUBSTEPS], False, x, u, course, d, physical, theta)
-        for j in range(n_x):
-            values[i, j] = x[j]
-
-
-@helper
-def move_lanes(integers, reals, offset, direction, t, points, u, known, values):
-    """The same, so many at a time."""
+    """The states one sample after the points, so many at a time."""
     lanes = lanes_at(integers[OF_LANES])
     n_x, n_theta, p, n_d = integers[STATES], integers[THETA], integers[ENTRIES], integers[DISTURBANCES]
-    own, n_m, M, nominal = integers[OWN], direction.shape[1], points.shape[0], reals[1:]
+    n_m, M, nominal = direction.shape[1], points.shape[0], reals[1:]
     disturbances, now = integers[SIZES + p : SIZES + p + n_d], nominal.copy()
-    T, X, U, D = np.full(LANES, t), np.empty((n_x, LANES)), np.empty((u.size, LANES)), np.empty((known.size, LANES))
-    acts, P = np.empty((own, LANES)), np.empty((now.size - n_theta, LANES))
-    for j in range(u.size):
-        U[j] = u[j]
-    for j in range(known.size):
-        D[j] = known[j]
+    T, X, U, D = np.full(LANES, t), np.empty((LANES, n_x)), np.empty((LANES, u.size)), np.empty((LANES, known.size))
+    acts, P = np.empty((LANES, n_theta)), np.empty((LANES, now.size - n_theta))
+    U[:], D[:] = u, known
     for first in range(0, M, LANES):
         for lane in range(LANES):
             i = min(first + lane, M - 1)
             if other_magnitudes(integers, direction, points, i):
                 put_magnitudes(integers, offset, direction, points[i], nominal, now)
             for j in range(n_d):
-                D[disturbances[j], lane] = points[i, n_x + n_m + j]
+                D[lane, disturbances[j]] = points[i, n_x + n_m + j]
             for j in range(n_x):
-                X[j, lane] = points[i, j]
-            for j in range(own):
-                acts[j, lane] = now[j]
+                X[lane, j] = points[i, j]
+            for j in range(n_theta):
+                acts[lane, j] = now[j]
             for j in range(n_theta, now.size):
-                P[j - n_theta, lane] = now[j]
-        lanes(T, reals[0], integers[SUBSTEPS], X, U, acts, D, P)
+                P[lane, j - n_theta] = now[j]
+        lanes(T, reals[0], integers[SUBSTEPS], X, U, acts, D, P, X)
         for lane in range(min(LANES, M - first)):
             for j in range(n_x):
-                values[first + lane, j] = X[j, lane]
+                values[first + lane, j] = X[lane, j]
 
 
 @helper
