@@ -16,7 +16,7 @@ from numba import float64, int64, uint64, void
 from fdi_gym.effects import AGAIN, FAULTS, at, caught, page_of, pointer, row_of, sense, theta_over, wrong_sensors
 from fdi_gym.integration import FEW, LANES, interval_at, lanes_at
 from fdi_gym.kernels import M, V, compiled, control_at, helper, known_at, map_at, outside_at
-from fdi_gym.noise import fill
+from fdi_gym.noise import white
 
 TILE = 32  # samples that flights fly before the turn of the next ones
 
@@ -63,6 +63,18 @@ def _move(interval, lanes, dt, substeps, t, x, u, theta, d, p, courses, drifts, 
                 now[j] = theta[i, j]
 
 
+@helper
+def _injected(k, last, samples, process_noise, sensor_noise, n_y, noise):
+    """The noise of samples from k on, from a flight's own tables."""
+    n = noise.shape[1] - n_y
+    w, v = at(pointer(process_noise), (last, n), float64), at(pointer(sensor_noise), (last + 1, n_y), float64)
+    for s in range(min(samples, last + 1 - k)):
+        for j in range(n_y):
+            noise[s, j] = v[k + s, j]
+        for j in range(n if k + s < last else 0):
+            noise[s, n_y + j] = w[k + s, j]
+
+
 _I, _D3 = int64[::1], float64[:, :, ::1]
 
 
@@ -101,11 +113,10 @@ def fly(
     t, x, u, d = np.zeros(LANES), np.zeros((LANES, n)), np.zeros((LANES, n_u)), np.zeros((LANES, n_d))
     p, theta_k, after = np.zeros((LANES, n_p)), np.zeros((LANES, n_theta)), np.zeros((LANES, n))
     courses = np.zeros((LANES, 3, n_theta))
-    beside, segment = np.zeros(LANES, np.int64), np.zeros(LANES, np.int64)
+    beside, segment, until = np.zeros(LANES, np.int64), np.zeros(LANES, np.int64), np.zeros(LANES, np.int64)
     moving, drifts = np.zeros(LANES, np.bool_), np.zeros(LANES, np.bool_)
     y, fed, r, wrong = np.empty(n_y), np.empty(n_y), np.empty(n_r), np.zeros((n_y, FAULTS))
-    used, words, normals = sigma > 0.0, np.empty((2, TILE), np.uint64), np.zeros((LANES, TILE, sigma.size))
-    steady = not used.any()
+    used, words, noise = sigma > 0.0, np.empty((2, TILE), np.uint64), np.zeros((LANES, TILE, sigma.size))
     for tile in range(0, samples, TILE):
         position, end = 0, min(tile + TILE, samples)
         while position < slots.size:
@@ -119,11 +130,11 @@ def fly(
                     u[i, j] = U[slot, j]
                 for j in range(n_p):
                     p[i, j] = P[slot, j]
-                drifts[i] = theta_over(k, True, dt, slot, effects, counts, values, held, nominal, i, courses)
-                for j in range(n_theta):
-                    theta_k[i, j] = courses[i, 0, j]
-                if moving[i] and not (process_noise[slot] or steady):
-                    fill(seed[slot], k, end - tile, used, words, page_of(normals, i))
+                until[i] = theta_over(k, True, dt, slot, effects, counts, values, held, nominal, i, courses, drifts, theta_k)
+                if process_noise[slot]:
+                    _injected(k, steps[slot], end - tile, process_noise[slot], sensor_noise[slot], n_y, page_of(noise, i))
+                elif moving[i]:
+                    white(seed[slot], k, end - tile, sigma, limit, used, words, page_of(noise, i))
             for s in range(tile, end):
                 row = first + s
                 for i in range(width):
@@ -131,7 +142,7 @@ def fly(
                         continue
                     # sample k: what acts, what is measured, what is known
                     slot = beside[i]
-                    k, last, injected = sample[slot], steps[slot], process_noise[slot] != 0
+                    k, last = sample[slot], steps[slot]
                     t[i] = k * dt
                     references = at(pointer(reference_at[slot]), (last + 1, n_r), float64)
                     disturbances = at(pointer(disturbance_at[slot]), (last + 1, n_d), float64)
@@ -142,20 +153,18 @@ def fly(
                             r[j] += references_added[s, slot, j]
                     for j in range(n_d):
                         d[i, j] = disturbances[min(k, last - 1) * disturbance_step[slot], j]
-                    if counts[slot]:
-                        drifts[i] = theta_over(k, True, dt, slot, effects, counts, values, held, nominal, i, courses)
-                        for j in range(n_theta):
-                            a, b, g = courses[i, 0, j], courses[i, 1, j], courses[i, 2, j]
-                            theta_k[i, j] = a if g < 0.0 else a + b
+                    if k >= until[i]:
+                        until[i] = theta_over(
+                            k, True, dt, slot, effects, counts, values, held, nominal, i, courses, drifts, theta_k
+                        )
                     acts, faulty = row_of(theta_k, i), tabled or reports or (layered and counts[slot] > 0)
                     output(t[i], row_of(x, i), row_of(u, i), acts[:own], row_of(d, i), row_of(p, i), y)
                     if faulty:
                         wrong_sensors(k, s, slot, sensors, acts, own, reporting, seed, dropped, wrong)
                     seen = row_of(obs, row * obs.shape[1] + slot)
+                    again, errors = reports and reporting[slot, 0, AGAIN] != 0.0, row_of(page_of(noise, i), s - tile)
                     sense(
-                        k, y, page_of(normals, i), s - tile, sigma, limit, injected,
-                        at(pointer(sensor_noise[slot]), (last + 1, n_y), float64), faulty, wrong,
-                        reports and reporting[slot, 0, AGAIN] != 0.0, true_feedback != 0, healthy, sensor_box,
+                        k, y, errors, faulty, wrong, again, true_feedback != 0, healthy, sensor_box,
                         page_of(histories, slot), page_of(readings, slot), seen, fed,
                     )  # fmt: skip
                     for j in range(n_u):
@@ -179,34 +188,28 @@ def fly(
                             if inputs[s, slot, j]:
                                 u[i, j] = min(max(u[i, j] + inputs[s, slot, j], command_box[0, j]), command_box[1, j])
                     if caught(k, slot, effects, counts, u, i, held):  # other faults do in the step what the sensors met
-                        drifts[i] = theta_over(k, False, dt, slot, effects, counts, values, held, nominal, i, courses)
-                        for j in range(n_theta):
-                            theta_k[i, j] = courses[i, 0, j]
+                        theta_over(k, False, dt, slot, effects, counts, values, held, nominal, i, courses, drifts, theta_k)
                 # the interval to sample k + 1
                 _move(interval, lanes, dt, substeps, t, x, u, theta_k, d, p, courses, drifts, moving, beside, after, THETA)
                 for i in range(width):
                     if not moving[i]:
                         continue
                     slot = beside[i]
-                    k, last, injected = sample[slot], steps[slot], process_noise[slot] != 0
+                    k, finite = sample[slot], True
                     for j in range(own, n_theta):
                         a, b, g = courses[i, 0, j], courses[i, 1, j], courses[i, 2, j]
                         THETA[slot, j] = a + (b * (dt if g < 0.0 else np.exp(-g * dt)) if b else 0.0)
-                    w, lost = at(pointer(process_noise[slot]), (last, n), float64), False
                     for j in range(n):
-                        if injected:
-                            after[i, j] += w[k, j]
-                        elif used[n_y + j]:
-                            after[i, j] += sigma[n_y + j] * min(max(normals[i, s - tile, n_y + j], -limit), limit)
-                        lost = lost or not np.isfinite(after[i, j])
-                    if not lost:  # else the state has left the numbers: the last finite one is what is shown
+                        after[i, j] += noise[i, s - tile, n_y + j]
+                        finite &= abs(after[i, j]) < np.inf
+                    if finite:  # else the state has left the numbers: the last finite one is what is shown
                         for j in range(n):
                             x[i, j] = after[i, j]
                     sample[slot] = k + 1
-                    references = at(pointer(reference_at[slot]), (last + 1, n_r), float64)
+                    references = at(pointer(reference_at[slot]), (steps[slot] + 1, n_r), float64)
                     for j in range(n_r):
                         r[j] = references[(k + 1) * reference_step[slot], j]
-                    if lost or outside(t[i] + dt, row_of(x, i), r):
+                    if not finite or outside(t[i] + dt, row_of(x, i), r):
                         status[slot] = ENDED
             for i in range(width):
                 for j in range(n):

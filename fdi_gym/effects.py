@@ -10,6 +10,7 @@ from numba import float64, int64, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from fdi_gym.kernels import helper, inlined
 from fdi_gym.noise import uniform
 
 # Columns of a flight's table of effects: entry of theta, first and end step, kind, and what the kind needs
@@ -23,6 +24,8 @@ GAIN, BIAS, NOISE, FROZEN, LAG, MISSING, FAULTS = range(7)
 # reading to the next; samples by which all of them lag; 1 where the last reading is shown again
 BEGIN, STAY, PERIOD, DELAY, AGAIN, REPORTING = range(6)
 
+NEVER = 2**62  # a sample that does not come
+
 
 def _pointer_at(typing_context, where):
     def codegen(context, builder, _, arguments):
@@ -35,38 +38,42 @@ pointer: Any = intrinsic(_pointer_at)  # a pointer from an address
 at: Any = numba.carray  # type: ignore[attr-defined]  # the array there
 
 
-@numba.njit(inline="always")
+@inlined
 def row_of(table, i):
     """Row i of a table, without counting who refers to it (which costs more than to read it): the table outlives it."""
     n = table.shape[-1]
     return at(pointer(table.ctypes.data + 8 * i * n), (n,), float64)
 
 
-@numba.njit(inline="always")
+@inlined
 def page_of(tables, i):
     """Table i of so many, in the same way."""
     rows, n = tables.shape[-2], tables.shape[-1]
     return at(pointer(tables.ctypes.data + 8 * i * rows * n), (rows, n), float64)
 
 
-@numba.njit
-def theta_over(k, seen, dt, slot, effects, counts, values, held, nominal, i, courses):
+@helper
+def theta_over(k, seen, dt, slot, effects, counts, values, held, nominal, i, courses, drifts, theta):
     """theta over step k, tau after sample k, from the effects on flight `slot` that act then; of two, the later listed.
 
-    It is a + b exp(-g tau), or a + b tau where g < 0, of courses[i] = (a, b, g).
+    It is a + b exp(-g tau), or a + b tau where g < 0, of courses[i] = (a, b, g); theta[i] is what it is at first, and
+    drifts[i] whether it changes within the step.
 
     `seen`: as the sensors meet it at sample k, before the command of step k is known.
-    Returns whether any entry drifts.
+    Returns the next step at which to ask again.
     """
     table, course = page_of(effects, slot), page_of(courses, i)
     a, b, g = row_of(course, 0), row_of(course, 1), row_of(course, 2)
     for j in range(a.size):
         a[j], b[j], g[j] = nominal[j], 0.0, 0.0
-    drifts = False
+    drifts[i], until = False, NEVER
     for e in range(counts[slot]):
-        onset = np.int64(table[e, ONSET])
-        if not onset <= k < table[e, END]:
+        onset, end = np.int64(table[e, ONSET]), np.int64(table[e, END])
+        if k < onset:
+            until = min(until, onset)
+        if not onset <= k < end:
             continue
+        until = min(until, end)
         j, kind, value = np.int64(table[e, ENTRY]), np.int64(table[e, KIND]), table[e, VALUE]
         since = (k - onset) * dt
         b[j] = g[j] = 0.0
@@ -75,13 +82,13 @@ def theta_over(k, seen, dt, slot, effects, counts, values, held, nominal, i, cou
         elif kind == INCIPIENT:
             a[j], g[j] = value, table[e, FIRST]
             b[j] = (nominal[j] - value) * np.exp(-g[j] * since)
-            drifts = True
+            drifts[i] = True
         elif kind == RAMP:
             share, then = min(since / table[e, FIRST], 1.0), min((since + dt) / table[e, FIRST], 1.0)
             a[j] = nominal[j] + (value - nominal[j]) * share
             if then > share:
                 b[j], g[j] = (value - nominal[j]) * (then - share) / dt, -1.0
-                drifts = True
+                drifts[i] = True
         elif kind == INTERMITTENT:
             a[j] = value if (since / table[e, FIRST] + 1e-9) % 1.0 < table[e, SECOND] else nominal[j]
         elif kind == SQUARE:
@@ -94,10 +101,14 @@ def theta_over(k, seen, dt, slot, effects, counts, values, held, nominal, i, cou
             a[j] = nominal[j]
         else:
             a[j] = held[slot, e]
-    return drifts
+        if kind != ABRUPT:
+            until = k + 1
+    for j in range(a.size):
+        theta[i, j] = a[j] if g[j] < 0.0 else a[j] + b[j]
+    return until
 
 
-@numba.njit
+@helper
 def caught(k, slot, effects, counts, u, i, held):
     """Hold faults of flight `slot` that begin at step k catch the command u[i]. Returns whether it has any."""
     holds = False
@@ -109,7 +120,7 @@ def caught(k, slot, effects, counts, u, i, held):
     return holds
 
 
-@numba.njit
+@helper
 def wrong_sensors(k, s, slot, sensors, theta, own, tables, seed, drops, f):
     """f (n_y, FAULTS): what is wrong with each sensor of flight `slot` at sample k, from all who have a say."""
     n_y, reporting, dropped = f.shape[0], page_of(tables, slot), row_of(drops, slot)
@@ -131,33 +142,35 @@ def wrong_sensors(k, s, slot, sensors, theta, own, tables, seed, drops, f):
                 f[i, MISSING] += dropped[i]
 
 
-@numba.njit(inline="always")
-def sense(k, y, z, row, sigma, limit, injected, v, faulty, f, again, true_feedback, healthy, box, history, last, shown, fed):
+@inlined
+def sense(k, y, noise, faulty, f, again, true_feedback, healthy, box, history, last, shown, fed):
     """What the sensors say: `shown` (NaN where one does not report), and `fed`, what the controller gets.
-
     `last` has the last reading of each, and what it last fed; `again`: it is shown in place of NaN. `true_feedback`: the
     controller gets no noise. `healthy`: no faults.
     """
+    for i in range(y.size if history.shape[0] else 0):
+        history[k % history.shape[0], i] = y[i]
+    if not faulty:
+        for i in range(y.size):
+            shown[i] = last[0, i] = min(max(y[i] + noise[i], box[0, i]), box[1, i])
+        for i in range(y.size):
+            fed[i] = last[1, i] = y[i] if true_feedback else shown[i]
+        return
     for i in range(y.size):
-        true = y[i]
-        if history.shape[0]:
-            history[k % history.shape[0], i] = true
-        noise = v[k, i] if injected else sigma[i] * min(max(z[row, i], -limit), limit) if sigma[i] else 0.0
-        clean = true if true_feedback else min(max(true + noise, box[0, i]), box[1, i])
-        missing = frozen = False
-        if faulty:
-            lag = min(np.int64(f[i, LAG]), history.shape[0] - 1)
-            if lag > 0:
-                true = history[max(k - lag, 0) % history.shape[0], i]
-            if f[i, NOISE]:
-                noise += f[i, NOISE] * noise
-            if f[i, GAIN]:
-                true += f[i, GAIN] * true
-                noise += f[i, GAIN] * noise
-            if f[i, BIAS]:
-                true += f[i, BIAS]
-            frozen, missing = f[i, FROZEN] != 0.0, f[i, MISSING] != 0.0
-        says = min(max(true + noise, box[0, i]), box[1, i])
+        true, error = y[i], noise[i]
+        clean = true if true_feedback else min(max(true + error, box[0, i]), box[1, i])
+        lag = min(np.int64(f[i, LAG]), history.shape[0] - 1)
+        if lag > 0:
+            true = history[max(k - lag, 0) % history.shape[0], i]
+        if f[i, NOISE]:
+            error += f[i, NOISE] * error
+        if f[i, GAIN]:
+            true += f[i, GAIN] * true
+            error += f[i, GAIN] * error
+        if f[i, BIAS]:
+            true += f[i, BIAS]
+        frozen, missing = f[i, FROZEN] != 0.0, f[i, MISSING] != 0.0
+        says = min(max(true + error, box[0, i]), box[1, i])
         feeds = true if true_feedback else says
         if (frozen or missing) and k:
             says, feeds = last[0, i], last[1, i]

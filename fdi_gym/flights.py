@@ -10,14 +10,13 @@ import numpy as np
 from fdi_gym import effects
 from fdi_gym.bounds import check_bounds
 from fdi_gym.closed_loop import FLYING, OVER, TERMINATED
+from fdi_gym.effects import NEVER
 from fdi_gym.faults import Abrupt, Effect, FaultScenario, Hold, Incipient, Intermittent, Ramp, Samples, Sampling, Square
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Plant
 from fdi_gym.truth import Inputs
 
 Array = np.ndarray
-
-NEVER = 2**62  # a sample that does not come
 
 
 class Chunk(NamedTuple):

@@ -2,20 +2,19 @@
 
 from typing import Any
 
-import numba
 import numpy as np
 from numba import boolean, float64, int64, void
 
-from fdi_gym.kernels import M, V, around, compiled, function_at, map_at, stack
+from fdi_gym.kernels import M, V, around, compiled, function_at, inlined, map_at, stack
 
 
-@numba.njit(inline="always")
+@inlined
 def _copy(table, i, other, j):
     for a in range(other.shape[1]):
         other[j, a] = table[i, a]
 
 
-@numba.njit
+@inlined
 def _theta_at(tau, a, b, g, theta):
     for j in range(theta.size):
         if b[j] == 0.0:

@@ -61,8 +61,9 @@ _ROLES = {
 
 
 _carray: Any = numba.carray  # type: ignore[attr-defined]  # the array at a pointer
-njit: Any = numba.njit  # what only kernels call needs no way in from Python or C, slow to compile: `helper`
+njit: Any = numba.njit  # what only kernels call needs no way in from Python or C, slow to compile: `helper`, `inlined`
 helper = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+inlined = njit(error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 _signatures: dict[Any, Any] = {}  # of the kernels, compiled when they are first needed
 _announced: set[str] = set()  # source files whose cold compilation has been announced
@@ -141,8 +142,7 @@ def around(make: Callable[..., Any], signature: Any, *kernels: Any, sizes: tuple
 
     `sizes`, if any, come first in what `make` gets; it may compile them in.
     """
-    inner = njit(error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-    function = make(*((sizes,) if sizes else ()), *(inner(k.py_func) for k in kernels))
+    function = make(*((sizes,) if sizes else ()), *(inlined(k.py_func) for k in kernels))
     function.__qualname__ = "_".join([function.__name__, *map(str, sizes), name_around(make, *kernels)])
     return _lazily(function, signature, kernels)
 
@@ -159,7 +159,7 @@ def stack(size: int) -> Any:
 
     _room: Any = intrinsic(_room_at)
 
-    @njit(error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    @inlined
     def array():
         return _carray(_room(), size)
 

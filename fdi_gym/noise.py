@@ -128,6 +128,15 @@ def fill(seed, start, samples, used, words, z):
 
 
 @numba.njit(error_model="numpy")
+def white(seed, start, samples, sigma, limit, used, words, z):
+    """z[s, j] = the noise of channel j at sample start + s, its normals within `limit`; 0 where the channel is not used."""
+    fill(seed, start, samples, used, words, z)
+    for s in range(samples):
+        for j in range(sigma.size):
+            z[s, j] = sigma[j] * min(max(z[s, j], -limit), limit)
+
+
+@numba.njit(error_model="numpy")
 def uniform(seed, sample, channel):
     """A number in [0, 1) for a sample and a channel, apart from all noise."""
     a, b, _, _ = philox(uint64(sample) & LOW, APART + uint64(channel), uint64(0), uint64(0), seed & LOW, seed >> HALF)
