@@ -29,9 +29,12 @@ def new_figure(width: float, height: float) -> Any:
 
 
 def plain(axis: Any, title: str = "") -> None:
-    """No box, small letters, the title at the left above."""
+    """No box, small letters, numbers on the axes as they are (no offset to add), the title at the left above."""
     axis.spines[["top", "right"]].set_visible(False)
     axis.tick_params(labelsize=SMALL, length=2.5)
+    for formatter in (axis.xaxis.get_major_formatter(), axis.yaxis.get_major_formatter()):
+        if hasattr(formatter, "set_useOffset"):
+            formatter.set_useOffset(False)
     if title:
         axis.set_title(title, loc="left", fontsize=TEXT, pad=3)
 

@@ -16,6 +16,8 @@ from fdi_gym import palette
 from fdi_gym.plants import cmg_satellite as cmg
 from fdi_gym.plots.panels import drawn, legend, new_figure, plain, truth
 
+LEAST = 0.05  # what an axis of Figure 3 shows at least
+
 
 def figure_3(found: dict[str, Any], profile: str, path: Path) -> bool:
     """The whole time line, a row for each unit, and a zoom at each change beside it; False while it is not measured."""
@@ -41,6 +43,9 @@ def figure_3(found: dict[str, Any], profile: str, path: Path) -> bool:
             drawn_lines = [drawn(axis, t, lines[m], i, lw=1.0 if place else 0.8, label=m) for i, m in enumerate(GRIDS)]
             ink = truth(axis, t, lines["truth"], label="true", lw=0.9)
             axis.set_xlim(t[0], t[-1])
+            low, high = axis.get_ylim()
+            if high - low < LEAST:  # nothing happens there: a zoom would show the digits that are kept
+                axis.set_ylim((low + high - LEAST) / 2, (low + high + LEAST) / 2)
             handles = [ink, *drawn_lines]
             if unit == 3:
                 axis.set_xlabel("time [s]", fontsize=8)
@@ -67,7 +72,7 @@ def severity(r: Results, path: Path) -> bool:
         axis.vlines(x, shares[:, 1], shares[:, 2], color=palette.line(i)[0], lw=0.8)
     axis.axvline(0.05, color=palette.LINES[6], lw=0.8, ls=":")
     axis.annotate(
-        "label threshold", (0.05, 0), xycoords=("data", "axes fraction"), fontsize=7, rotation=90, va="bottom", ha="right"
+        "label threshold", (0.05, 0.6), xycoords=("data", "axes fraction"), fontsize=7, rotation=90, va="center", ha="right"
     )
     axis.set(xscale="log", ylim=(-2, 103))
     axis.set_xlabel("loss of effectiveness [-]", fontsize=8)

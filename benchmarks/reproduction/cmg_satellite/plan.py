@@ -86,6 +86,7 @@ def blocks(quick: bool) -> list[Block]:
     severity += [Block("severity", "regulate", 45, "oracle", 0, float(a)) for a in REFERENCE["severity"]["regulate"]]
     others = {"MEKF": 4, "CLAIR": 4, "UKF": 4, "dual GAUKF": 4, "oracle": 1}
     bench = [Block("bench", "slew", s, m, b) for s in LEVELS for m, n in others.items() for b in several(n)]
+    bench += [Block("table5", "slew", s, "UKF", b) for s in LEVELS for b in several(4)]
     settings = [
         Block("hard", "slew", r["snr"], m, 0, r["mismatch"]) for r in REFERENCE["hard_setting"] for m in r["methods"]
     ]
