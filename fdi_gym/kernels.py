@@ -27,6 +27,7 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
+import math
 import sys
 import threading
 from collections.abc import Callable, Collection
@@ -147,12 +148,14 @@ def around(make: Callable[..., Any], signature: Any, *kernels: Any, sizes: tuple
     return _lazily(function, signature, kernels)
 
 
-def stack(size: int) -> Any:
-    """A function that gives an array (size,) of float64 on the stack, uninitialised; it lives as long as its caller."""
+def stack(*shape: int) -> Any:
+    """A function that gives a float64 array of this shape on the stack, uninitialised; it lives as long as its caller."""
+    size = max(math.prod(shape), 1)
 
     def _room_at(typing_context):
         def codegen(context, builder, signature, arguments):
-            room = cgutils.alloca_once(builder, ir.ArrayType(ir.DoubleType(), max(size, 1)))
+            room = cgutils.alloca_once(builder, ir.ArrayType(ir.DoubleType(), size))
+            room.align = 64  # that no vector lies in two lines of the cache
             return builder.bitcast(room, context.get_value_type(signature.return_type))
 
         return types.CPointer(float64)(), codegen
@@ -161,7 +164,7 @@ def stack(size: int) -> Any:
 
     @inlined
     def array():
-        return _carray(_room(), size)
+        return _carray(_room(), shape)
 
     return array
 

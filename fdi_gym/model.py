@@ -102,16 +102,16 @@ class Model:
         others = (getattr(own, role) or getattr(kernels, role) for role in Addresses._fields[2:])
         return Addresses(*map(kernels.address, (interval, lanes, *others)))
 
-    @functools.cached_property
-    def tangent(self) -> int:
-        """Address of `tangent.tangent` around its kernels; 0 where it says no derivatives."""
+    def tangent(self, columns: int) -> int:
+        """Address of `tangent.tangent` around its kernels, for so many deviations; 0 where it says no derivatives."""
         from fdi_gym import kernels
         from fdi_gym.tangent import tangent
 
-        own = self.kernels
+        own, (n_x, _, _, n_d, n_p) = self.kernels, self._widths
         if own is None or own.jacobian is None:
             return 0
-        return kernels.address(tangent(own.dynamics, own.jacobian, own.project))
+        sizes = n_x, self.own_theta, n_d, n_p, columns
+        return kernels.address(tangent(sizes, own.dynamics, own.jacobian, own.project))
 
     def _rows(self, value: Array | None, default: Array) -> Array:
         rows = default if value is None else np.asarray(value, float)

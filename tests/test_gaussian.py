@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from conftest import PLANTS, build
 
+from fdi_gym.discovery import load_plant
 from fdi_gym.estimation import automaton, gaussian
 from fdi_gym.estimation.gaussian import RULES
 from fdi_gym.kernels import kernel
@@ -305,6 +306,24 @@ def test_linear_sensors_are_the_cheap_case_of_the_rules(plant_id):
         assert own.K[i] / unit == pytest.approx(scattered(K, rows) / unit, abs=TOLERANCE)
     for name in ("nu", "S", "nis", "log_likelihood"):
         assert getattr(got, name) == pytest.approx(getattr(own, name), rel=1e-9, abs=1e-12), name
+
+
+@pytest.mark.parametrize("plant_id", ["HUAVHover", "ThreeTank", "B747Lateral"])
+@pytest.mark.parametrize("lines", [None, 3])
+def test_faults_of_linear_sensors_need_no_differences(plant_id, lines, monkeypatch):
+    monkeypatch.setitem(CLOCKS, "failing", load_plant(plant_id, sensor_faults=True))
+    case = Case("failing", lines)
+    seen, (m, n_x) = case.seen(), case.model.plain.shape
+    assert (m, n_x) == (case.y.shape[1], len(case.plant.states))
+    got = case.update("extended", seen)
+    differenced = case.update("extended", seen, model=case.model._replace(plain=np.zeros((0, n_x))))
+    for i in range(EPISODES):
+        assert_close(got.X[i], got.P[i], differenced.X[i], differenced.P[i])
+
+
+def test_sensors_that_see_more_than_the_state_are_not_plain():
+    assert Case("clock").model.plain.shape == (0, 2)
+    assert Case("MissilePitch").model.plain.shape == (0, 5)
 
 
 def scattered(K, rows):

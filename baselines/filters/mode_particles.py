@@ -111,7 +111,7 @@ def particle_filter(b: Hypotheses, count: int, every: int) -> Filter:
 
     def update(s: Particles, at: Interval, y: Array, seen: Array) -> Particles:
         n, which = len(y), s.label.reshape(-1)
-        mine = model.on(offset[which], direction[which], model.Q[which])
+        mine = model.on(offset[which], direction[which])
         done = mine.update("extended", s.X.reshape(-1, N), s.P.reshape(-1, N, N), at, y, seen)
         log = s.log + done.log_likelihood.reshape(n, count)
         log -= logsumexp(log, axis=1, keepdims=True)

@@ -25,14 +25,15 @@ import msgspec
 import numpy as np
 from scipy.special import logsumexp
 
+from baselines.filters.onset_kernels import lines, merged, put, taken
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.diagnosis.fitting import VALIDATION_SEED, floored
-from fdi_gym.estimation.augmented import augmented, on_lines
+from fdi_gym.estimation.augmented import AugmentedModel, augmented, on_lines
 from fdi_gym.estimation.belief import Belief, fault_inputs
 from fdi_gym.estimation.decision import Reading, Rule, by_candidate
 from fdi_gym.estimation.events import Events, events_of
 from fdi_gym.estimation.interval import Interval
-from fdi_gym.estimation.mixing import mixture
+from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, NotApplicableError, Plant
 
 FIRST, DRAWN = 700_000, 2000  # scenarios from VALIDATION_SEED + FIRST on
@@ -63,14 +64,6 @@ def on_model(plant: Plant, belief: Belief) -> Belief:
     return msgspec.structs.replace(belief, Q=floored(plant, plant.Q), R=R)
 
 
-def merged(log: Array, X: Array, P: Array) -> tuple[Array, Array, Array]:
-    """Log weight (a,), mean (a, N) and covariance (a, N, N) of the mixtures of log (a, b), X (a, b, N), P (a, b, N, N)."""
-    total = np.asarray(logsumexp(log, axis=1))
-    w = np.exp(log - total[:, None])[:, None]
-    mean, covariance = mixture(w, X, P)
-    return total, mean[:, 0], covariance[:, 0]
-
-
 class Bank:
     """The filter's functions for a plant, a belief and events."""
 
@@ -89,7 +82,8 @@ class Bank:
         inputs = fault_inputs(plant)
         places = events.entries.tolist()
         self.p = len(inputs.entries)
-        self.known = [(j, places.index(e)) for j, e in enumerate(inputs.entries.tolist()) if e in places]
+        known = [(j, places.index(e)) for j, e in enumerate(inputs.entries.tolist()) if e in places]
+        self.known = np.array(known, np.int64).reshape(-1, 2).T  # (2, entries): of the fault vector, of the events
 
     def start(self, n: int) -> Onsets:
         """Healthy, and nothing has begun."""
@@ -103,23 +97,19 @@ class Bank:
             np.tile(self.plant.trim_command, (n, 1)), np.zeros((n, m)), np.tile(model.R, (n, 1, 1)),
         )  # fmt: skip
 
-    def live(self, s: Onsets) -> tuple[Array, Array]:
-        """Which filters run: episodes and places (rows,) of the healthy ones and of all that have a weight."""
+    def live(self, s: Onsets) -> Array:
+        """Which filters run (rows,): the healthy ones and all that have a weight, numbered through all episodes."""
         runs = s.log > NEVER
         runs[:, 0] = True
-        return np.nonzero(runs)  # type: ignore[return-value]
+        return np.flatnonzero(runs)
 
-    def lines(self, s: Onsets, of: Array, place: Array) -> tuple[Array, Array]:
-        """Offsets (rows, p) and directions (rows, p, f) of these filters."""
+    def on(self, s: Onsets, rows: Array) -> AugmentedModel:
+        """The model on the lines of these filters."""
         (_, p, f), (e, c) = self.events.direction.shape, self.events.spread.shape
-        offset, direction = np.zeros((len(of), p + e)), np.zeros((len(of), p + e, f + c))
-        acts = place > 0
-        kind, slot = np.divmod(place[acts] - 1, self.s)
-        length = s.length[of[acts], kind, slot]
-        offset[acts, :p] = length[:, None] * self.events.offset[kind] + s.held[of[acts], kind, slot]
-        direction[acts, :p, :f] = length[:, None, None] * self.events.direction[kind]
-        direction[:, p:, f:] = self.events.spread
-        return offset, direction
+        offset, direction = np.zeros((len(rows), p + e)), np.zeros((len(rows), p + e, f + c))
+        events = contiguous(self.events.offset), contiguous(self.events.direction), contiguous(self.events.spread)
+        lines(rows, self.s, contiguous(s.length), contiguous(s.held), *events, offset, direction)
+        return self.model.on(offset, direction)
 
     def ended(self, s: Onsets, step: Array) -> Onsets:
         """The weight of events that end within the period before a step goes back to the healthy filter."""
@@ -217,20 +207,18 @@ class Bank:
         age = (at.k[:, None, None] - s.onset) * self.plant.dt
         s = s._replace(length=self.events.at(np.maximum(age, 0.0)), u=at.u)
         rows = self.live(s)
-        X, P = s.X.copy(), s.P.copy()
-        X[rows], P[rows] = self.model.on(*self.lines(s, *rows)).predict("extended", X[rows], P[rows], at.of(rows[0]))
-        return s._replace(X=X, P=P)
+        X, P = self.on(s, rows).predict("extended", taken(s.X, rows), taken(s.P, rows), at.of(rows // self.count))
+        return s._replace(X=put(s.X, rows, X), P=put(s.P, rows, P))
 
     def update(self, s: Onsets, at: Interval, y: Array, seen: Array) -> Onsets:
         """Weigh and correct those that run; of those that have become negligible the place is free."""
-        of, place = rows = self.live(s)
-        X, P, log = s.X.copy(), s.P.copy(), s.log.copy()
-        model, healthy = self.model.on(*self.lines(s, *rows)), place == 0
-        done = model.update("extended", X[rows], P[rows], at.of(of), y[of], seen[of])
-        X[rows], P[rows] = done.X, done.P
-        log[rows] = np.maximum(log[rows] + done.log_likelihood, NEVER)
+        rows = self.live(s)
+        of, healthy = rows // self.count, rows % self.count == 0
+        done = self.on(s, rows).update("extended", taken(s.X, rows), taken(s.P, rows), at.of(of), y[of], seen[of])
+        log = put(s.log, rows, np.maximum(taken(s.log, rows) + done.log_likelihood, NEVER))
         log = np.where(s.log <= NEVER, NEVER, log - logsumexp(log, axis=1, keepdims=True))
         log[:, 1:] = np.where(log[:, 1:] < NEGLIGIBLE, NEVER, log[:, 1:])
+        X, P = put(s.X, rows, done.X), put(s.P, rows, done.P)
         return s._replace(X=X, P=P, log=log, nu=done.nu[healthy], S=done.S[healthy])
 
     def read(self, s: Onsets) -> Reading:
@@ -242,14 +230,11 @@ class Bank:
         for kind, label in enumerate(self.events.label.tolist()):
             probs[:, label] += by_kind[:, kind]
         probs /= probs.sum(axis=1, keepdims=True)
-        rows = self.live(s)
-        offset, direction = self.lines(s, *rows)
-        theta = np.zeros((n, self.count, offset.shape[1]))
-        theta[rows] = offset + (direction @ s.X[rows][:, self.model.z, None])[..., 0]
-        mean = (w[..., None] * theta).sum(axis=1)
-        z = np.zeros((n, self.p))
-        for j, place in self.known:
-            z[:, j] = mean[:, place]
+        z, (j, at) = np.zeros((n, self.p)), self.known
+        m = s.X[:, 1:, self.m].reshape(n, self.r, self.s, -1, 1)
+        along = self.events.offset[:, None, at] + (self.events.direction[:, None, at] @ m)[..., 0]
+        theta = s.length[..., None] * along + s.held[..., at]  # (n, r, s, entries)
+        z[:, j] = (w[:, 1:, None] * theta.reshape(n, self.count - 1, len(at))).sum(axis=1)
         x = (w[..., None] * s.X[..., self.model.x]).sum(axis=1)
         return Reading(z, x=x, nu=s.nu, S=s.S, probs=probs)
 

@@ -90,7 +90,7 @@ def rows(plant: Plant, belief: Belief) -> Rows:
 class Bank(NamedTuple):
     """State of the oracle; each episode carries its own truth."""
 
-    X: Array  # (n, r, N)
+    X: Array  # (n, r, N), the healthy one first; the others are 0 where none of them can be
     P: Array  # (n, r, N, N)
     log: Array  # (n, r) log likelihood since the last change
     changes: Array  # (n, K + 1) bool
@@ -157,6 +157,9 @@ class _Told:
         self.own = self.offset.shape[1] if plant.bare is None else len(plant.estimated)
         self.rise = r.rise * np.array([scenario.steps for scenario in scenarios])[:, None]
         self.checks = None if plant.bare is None else SensorChecks(plant)
+        self.order = np.argsort(r.label, kind="stable")
+        self.sorted_label = r.label[self.order]
+        self.first = np.searchsorted(self.sorted_label, np.arange(len(plant.labels)))
 
     def start(self, n: int) -> Bank:
         """Healthy, and what n flights are told."""
@@ -197,30 +200,30 @@ class _Told:
         since = np.where(changed, 1.0, s.since + 1.0)
         share = s.course[each, np.minimum(k, s.course.shape[1] - 1)]
         length = share[:, None] * np.where(now[:, None], np.minimum(since[:, None] / np.maximum(s.rise, 1.0), 1.0), 1.0)
-        X, P, log = s.X.copy(), s.P.copy(), np.where(changed[:, None], 0.0, s.log)
-        X[changed], P[changed] = X[changed, :1], P[changed, :1]
-        X[..., z] = np.where(changed[:, None, None], r.m0, X[..., z])
-        P[changed, :, z, :] = 0.0
-        P[changed, :, :, z] = 0.0
-        P[..., z, z] = np.where(changed[:, None, None, None], r.M0, P[..., z, z])
+        log = np.where(changed[:, None], 0.0, s.log)
         among = s.allowed[each, np.minimum(k, s.allowed.shape[1] - 1)]
-        moved, N = s._replace(X=X, P=P, log=log, now=now, since=since, length=length, among=among), X.shape[-1]
+        X, P, N = np.zeros(s.X.shape), np.zeros(s.P.shape), s.X.shape[-1]
+        moved = s._replace(X=X, P=P, log=log, now=now, since=since, length=length, among=among)
         for of, model, count in self.parts(moved):
-            rows = of[:, None], np.arange(count)
-            X1, P1 = model.predict("extended", X[rows].reshape(-1, N), P[rows].reshape(-1, N, N), at.of(of))
-            X[rows], P[rows] = X1.reshape(-1, count, N), P1.reshape(-1, count, N, N)
+            X0, P0, fresh = s.X[of, :count], s.P[of, :count], changed[of]
+            X0[fresh], P0[fresh] = X0[fresh, :1], P0[fresh, :1]
+            X0[fresh, :, z] = r.m0[:count]
+            P0[fresh, :, z, :] = 0.0
+            P0[fresh, :, :, z] = 0.0
+            P0[fresh, :, z, z] = r.M0[:count]
+            X1, P1 = model.predict("extended", X0.reshape(-1, N), P0.reshape(-1, N, N), at.of(of))
+            X[of, :count], P[of, :count] = X1.reshape(-1, count, N), P1.reshape(-1, count, N, N)
         return moved
 
     def update(self, s: Bank, at: Interval, y: Array, seen: Array) -> Bank:
         """Weigh and correct all that predicted."""
         N, m = s.X.shape[-1], s.nu.shape[-1]
-        X, P, log, nu, S = s.X.copy(), s.P.copy(), s.log.copy(), s.nu.copy(), s.S.copy()
+        X, P, log, nu, S = np.zeros(s.X.shape), np.zeros(s.P.shape), s.log.copy(), s.nu.copy(), s.S.copy()
         for of, model, count in self.parts(s):
-            rows = of[:, None], np.arange(count)
-            wide = X[rows].reshape(-1, N), P[rows].reshape(-1, N, N)
+            wide = s.X[of, :count].reshape(-1, N), s.P[of, :count].reshape(-1, N, N)
             done = model.update("extended", *wide, at.of(of), y[of], seen[of], self.r.R[:count])
-            X[rows], P[rows] = done.X.reshape(-1, count, N), done.P.reshape(-1, count, N, N)
-            log[rows] += done.log_likelihood.reshape(-1, count)
+            X[of, :count], P[of, :count] = done.X.reshape(-1, count, N), done.P.reshape(-1, count, N, N)
+            log[of, :count] += done.log_likelihood.reshape(-1, count)
             nu[of], S[of] = done.nu.reshape(-1, count, m)[:, 0], done.S.reshape(-1, count, m, m)[:, 0]
         found = s._replace(X=X, P=P, nu=nu, S=S, log=log)
         if self.checks is None or s.checks is None:
@@ -229,8 +232,9 @@ class _Told:
 
     def by_label(self, s: Bank, log: Array) -> Array:
         """Log likelihood (n, labels) of each label that can be, on average over its hypotheses."""
-        labels = len(self.plant.labels)
-        found = np.asarray(logsumexp(np.where(self.r.label == np.arange(labels)[:, None], log[:, None], -np.inf), axis=2))
+        sorted_log = log[:, self.order]
+        largest = np.maximum.reduceat(sorted_log, self.first, axis=1)
+        found = largest + np.log(np.add.reduceat(np.exp(sorted_log - largest[:, self.sorted_label]), self.first, axis=1))
         found[:, 0] = -np.inf
         if self.checks is not None and s.checks is not None:
             gain = self.checks.repeated(s.checks)
@@ -246,10 +250,10 @@ class _Told:
         model, log = self.r.model, s.log + self.r.log_prior
         by_label = self.by_label(s, log)
         probs = np.exp(by_label - logsumexp(by_label, axis=1, keepdims=True))
-        weight = np.zeros_like(log)
-        weight[:, 1:] = np.exp(log[:, 1:] - logsumexp(log[:, 1:], axis=1, keepdims=True)) * s.now[:, None]
-        deviation = s.length[..., None] * (self.offset + (self.direction @ s.X[..., model.z, None])[..., 0])
-        mean = (weight[..., None] * deviation).sum(axis=1)[:, : self.own]
+        mean, of = np.zeros((len(log), self.own)), np.flatnonzero(s.now)
+        weight = np.exp(log[of, 1:] - logsumexp(log[of, 1:], axis=1, keepdims=True)) * s.length[of, 1:]
+        on_line = (self.direction[1:, : self.own] @ s.X[of, 1:, model.z, None])[..., 0]
+        mean[of] = (weight[..., None] * (self.offset[1:, : self.own] + on_line)).sum(axis=1)
         return Reading(mean, x=s.X[:, 0, model.x], nu=s.nu, S=s.S, probs=probs)
 
     def expect(self, s: Bank, at: Interval) -> Array:

@@ -186,7 +186,7 @@ def update(
     nis, log, count = np.empty(n), np.empty(n), np.empty(n, np.int64)
     known = model.unmeasured if d is None else d
     _call(
-        kernels.update, (_rule(rule), *model.constants, model.H, seen, count), X, P, t, u, known, y, R,
+        kernels.update, (_rule(rule), *model.constants, model.H, model.plain, seen, count), X, P, t, u, known, y, R,
         X1, P1, nu, S, nis, log,
     )  # fmt: skip
     return Updated(X1, P1, nu, S, nis, log, count)

@@ -5,9 +5,21 @@ from __future__ import annotations
 import numpy as np
 from numba import boolean, float64, int64, void
 
-from fdi_gym.estimation.gaussian_moments import correct_episode, differentiated, linearised, through, through_matrix
-from fdi_gym.estimation.gaussian_points import COMMANDS, EXTENDED, KNOWN, SENSORS, STATES, TANGENT, pass_points
+from fdi_gym.estimation.gaussian_algebra import correct_episode, through_matrix, widen
+from fdi_gym.estimation.gaussian_moments import (
+    differenced,
+    differentiated,
+    heard,
+    linearised,
+    own_faults,
+    room_of,
+    sensed,
+    through,
+)
+from fdi_gym.estimation.gaussian_points import COMMANDS, EXTENDED, KNOWN, OUTPUTS, SENSORS, STATES, TANGENT, pass_points
 from fdi_gym.kernels import M, V, compiled, helper
+from fdi_gym.tangent import row
+from fdi_gym.vectors import width
 
 I1, B2, M3 = int64[::1], boolean[:, ::1], float64[:, :, ::1]
 # integers, reals, step, offset, direction: the constants of a model that tell its f and h, as `gaussian.bind` packs them
@@ -47,40 +59,41 @@ def predict(rule, integers, reals, step, offset, direction, limit, plant, X, P, 
         return
     _check(integers, step, X, t, u, known)
     _check_covariances(n, P, N, Q, N)
-    mean, cross, cov, F = np.empty(n_x), np.empty((n_x, N)), np.empty((n_x, n_x)), np.empty((n_x, N))
+    W, mean, room = width(N), np.empty(n_x), room_of(integers, reals, row(N))
+    F, cross, cov = np.empty((n_x, row(N))), np.empty((n_x, W)), np.empty((n_x, width(n_x)))
+    wide, across = np.zeros((N, W)), np.zeros((N, width(n_x)))
     for e in range(n):
-        line = e % offset.shape[0]
-        ue, de = u[e * u.shape[0] // n], known[e * known.shape[0] // n]
+        line, te = e % offset.shape[0], t[e * t.size // n]
+        Xe, ue, de = X[e], u[e * u.shape[0] // n], known[e * known.shape[0] // n]
         if plant.shape[0] > 0:
-            linearised(integers, offset[line], direction[line], plant, X[e], ue, de, F, mean)
-            through_matrix(F, P[e], cross, cov)
-        elif rule == EXTENDED and integers[TANGENT] != 0:
-            te = t[e * t.size // n]
-            differentiated(integers, reals, step, offset[line], direction[line], te, X[e], ue, de, F, mean)
-            through_matrix(F, P[e], cross, cov)
+            linearised(integers, offset[line], direction[line], plant, Xe, ue, de, F, mean)
+        elif rule != EXTENDED:
+            through(rule, True, integers, reals, offset[line], direction[line], te, Xe, P[e], ue, de, mean, cross, cov)
+        elif integers[TANGENT] != 0:
+            differentiated(integers, reals, step, offset[line], direction[line], te, Xe, ue, de, room, F, mean)
         else:
-            te = t[e * t.size // n]
-            through(
-                rule, True, integers, reals, step, offset[line], direction[line], te, X[e], P[e], ue, de, mean, cross, cov
-            )
+            differenced(integers, reals, step, offset[line], direction[line], te, Xe, ue, de, F, mean)
+        if plant.shape[0] > 0 or rule == EXTENDED:
+            widen(P[e], wide)
+            through_matrix(F, wide, across, cross, cov)
         Qe = Q[e % Q.shape[0]]
-        for i in range(N):
-            X1[e, i] = mean[i] if i < n_x else X[e, i]
+        P1e = P1[e]
+        for i in range(n_x):
+            X1[e, i] = mean[i]
             for j in range(i + 1):
-                if i < n_x:
-                    moved = cov[i, j]
-                elif j < n_x:
-                    moved = cross[j, i]
-                else:
-                    moved = 0.5 * (P[e, i, j] + P[e, j, i])
-                P1[e, i, j] = moved + Qe[i, j]
-                P1[e, j, i] = P1[e, i, j]
+                P1e[i, j] = P1e[j, i] = cov[i, j] + Qe[i, j]
+        for i in range(n_x, N):
+            X1[e, i] = Xe[i]
+            for j in range(n_x):
+                P1e[i, j] = P1e[j, i] = cross[j, i] + Qe[i, j]
+            for j in range(n_x, i + 1):
+                P1e[i, j] = P1e[j, i] = 0.5 * (P[e, i, j] + P[e, j, i]) + Qe[i, j]
         for i in range(N):
-            if P1[e, i, i] > limit[i]:
-                shrink = np.sqrt(limit[i] / P1[e, i, i])
+            if P1e[i, i] > limit[i]:
+                shrink = np.sqrt(limit[i] / P1e[i, i])
                 for j in range(N):
-                    P1[e, i, j] *= shrink
-                    P1[e, j, i] *= shrink
+                    P1e[i, j] *= shrink
+                    P1e[j, i] *= shrink
 
 
 @compiled(void(*MODEL, M, V, M, M, M, M3))
@@ -90,21 +103,22 @@ def differentiate(integers, reals, step, offset, direction, X, t, u, known, X1, 
     if n == 0:
         return
     _check(integers, step, X, t, u, known)
-    mean, moved = np.empty(n_x), np.empty((n_x, N))
+    mean, moved, room = np.empty(n_x), np.empty((n_x, row(N))), room_of(integers, reals, row(N))
     for e in range(n):
         line, te = e % offset.shape[0], t[e * t.size // n]
         ue, de = u[e * u.shape[0] // n], known[e * known.shape[0] // n]
-        differentiated(integers, reals, step, offset[line], direction[line], te, X[e], ue, de, moved, mean)
+        differentiated(integers, reals, step, offset[line], direction[line], te, X[e], ue, de, room, moved, mean)
         for i in range(N):
             X1[e, i] = mean[i] if i < n_x else X[e, i]
             for j in range(N):
                 F[e, i, j] = moved[i, j] if i < n_x else (1.0 if i == j else 0.0)
 
 
-@compiled(void(int64, *MODEL, M, B2, I1, M, M3, V, M, M, M, M3, M, M3, M, M3, V, V))
+@compiled(void(int64, *MODEL, M, M, B2, I1, M, M3, V, M, M, M, M3, M, M3, M, M3, V, V))
 def update(
-    rule, integers, reals, step, offset, direction, H, seen, count, X, P, t, u, known, y, R, X1, P1, nu, S, distance, log
-):
+    rule, integers, reals, step, offset, direction, H, plain, seen, count, X, P, t, u, known, y, R,
+    X1, P1, nu, S, distance, log,
+):  # fmt: skip
     """X1 and P1 after the sensors y (n, m) at t, of which `seen` reported."""
     (n, N), m = X.shape, integers[SENSORS]
     if n == 0:
@@ -112,30 +126,41 @@ def update(
     _check(integers, step, X, t, u, known)
     _check_covariances(n, P, N, R, m)
     _check_sensors(n, m, y, seen)
-    mean, cross, cov, U, white = np.zeros(m), np.zeros((m, N)), np.zeros((m, m)), np.empty((m, m)), np.empty(m)
+    W, mean, U, white = width(N), np.zeros(m), np.empty((m, m)), np.empty(m)
+    cross, cov, low = np.zeros((m, W)), np.zeros((m, width(m))), np.zeros((N + 1, W))
+    wide, across, F, faults = np.zeros((N, W)), np.zeros((N, width(m))), np.empty((m, W)), own_faults(integers)
+    room, x, values = room_of(integers, reals, W), np.empty(N), np.empty(integers[OUTPUTS])
     for e in range(n):
         ye, reported = y[e * y.shape[0] // n], seen[e * y.shape[0] // n]
         if not reported.any():
             pass  # and nothing of what the episode before has left enters
-        elif H.shape[0] > 0:
-            for a in range(m):
-                mean[a] = 0.0
-                for j in range(N):
-                    mean[a] += H[a, j] * X[e, j]
-            through_matrix(H, P[e], cross, cov)
+        elif H.shape[0] > 0 or rule == EXTENDED:
+            line, te, Xe = e % offset.shape[0], t[e * t.size // n], X[e]
+            widen(P[e], wide)
+            if H.shape[0] > 0:
+                for a in range(m):
+                    mean[a] = 0.0
+                    for j in range(N):
+                        mean[a] += H[a, j] * Xe[j]
+                through_matrix(H, wide, across, cross, cov)
+            elif plain.shape[0] > 0:
+                heard(integers, reals, faults, offset[line], direction[line], plain, Xe, F, mean)
+                through_matrix(F, wide, across, cross, cov)
+            else:
+                ue, de = u[e * u.shape[0] // n], known[e * known.shape[0] // n]
+                sensed(integers, reals, step, offset[line], direction[line], te, Xe, ue, de, room, x, values, F, mean)
+                through_matrix(F, wide, across, cross, cov)
         else:
-            line = e % offset.shape[0]
-            te, ue, de = t[e * t.size // n], u[e * u.shape[0] // n], known[e * known.shape[0] // n]
-            through(
-                rule, False, integers, reals, step, offset[line], direction[line], te, X[e], P[e], ue, de, mean, cross, cov
-            )
+            line, te = e % offset.shape[0], t[e * t.size // n]
+            ue, de = u[e * u.shape[0] // n], known[e * known.shape[0] // n]
+            through(rule, False, integers, reals, offset[line], direction[line], te, X[e], P[e], ue, de, mean, cross, cov)
         Re, count[e] = R[e % R.shape[0]], 0
         for a in range(m):
             count[e] += reported[a]
             for b in range(m):
                 cov[a, b] += Re[a, b]
         distance[e], log[e] = correct_episode(
-            X[e], P[e], ye, reported, mean, cov, cross, U, white, X1[e], P1[e], nu[e], S[e]
+            X[e], P[e], ye, reported, mean, cov, cross, low, U, white, X1[e], P1[e], nu[e], S[e]
         )
 
 
@@ -148,14 +173,14 @@ def correct(seen, X, P, y, mean, cross, S, X1, P1, nu, S1, K, distance, log):
     if mean.shape[0] != n or cross.shape != (n, N, m) or S.shape != (n, m, m) or P.shape != (n, N, N):
         raise ValueError("the shapes are X (n, N), P (n, N, N), mean (n, m), cross (n, N, m) and S (n, m, m)")
     _check_sensors(n, m, y, seen)
-    W, U, white = np.empty((m, N)), np.empty((m, m)), np.empty(m)
+    W, low, U, white = np.zeros((m, width(N))), np.zeros((N + 1, width(N))), np.empty((m, m)), np.empty(m)
     for e in range(n):
         for a in range(m):
             for i in range(N):
                 W[a, i] = cross[e, i, a]
         ye, reported = y[e * y.shape[0] // n], seen[e * y.shape[0] // n]
         distance[e], log[e] = correct_episode(
-            X[e], P[e], ye, reported, mean[e], S[e], W, U, white, X1[e], P1[e], nu[e], S1[e]
+            X[e], P[e], ye, reported, mean[e], S[e], W, low, U, white, X1[e], P1[e], nu[e], S1[e]
         )
         for a in range(m - 1, -1, -1):  # K' = U^-1 W
             for i in range(N):

@@ -24,6 +24,7 @@ class Model(NamedTuple):
     limit: Array  # (N,)
     linear: Array  # (n_x, ...), or (0, 0) where the plant is not linear
     H: Array  # (m, N), or (0, N) where the sensors are not
+    plain: Array  # (m, n_x) what sensors read of x where that is all but their own faults, or (0, n_x) where it is not
     unmeasured: Array  # (1, n_D) zeros
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -86,12 +87,15 @@ def bind(
     reals = np.concatenate([[plant.dt], plant.nominal_theta, plant.nominal_p])
     constants = (integers, reals, STEP * size, contiguous(offset), contiguous(direction))
     linear = _linear(plant, where["entries"])
-    return _with_addresses(plant, m, constants, STEP * size, widest, linear, contiguous(observed), np.zeros((1, n_D)))
+    plain = np.zeros((0, n_x)) if H is not None else _plain(plant, where["sensors"])
+    return _with_addresses(
+        plant, m, constants, STEP * size, widest, linear, contiguous(observed), plain, np.zeros((1, n_D))
+    )  # fmt: skip
 
 
 def _with_addresses(plant: Plant, m: int, constants: tuple[Array, ...], *others: Any) -> Model:
     integers, *rest = constants
-    addresses = plant.addresses.lanes, plant.addresses.output, plant.tangent
+    addresses = plant.addresses.lanes, plant.addresses.output, plant.tangent(len(others[0]))
     integers = np.concatenate([addresses, integers[ADDRESSES:]])
     return Model(plant, m, (integers, *rest), *others)
 
@@ -104,6 +108,22 @@ def _positions(name: str, given: Any, count: int) -> Array:
     if len(set(positions.tolist())) < len(positions) or not all(0 <= i < count for i in positions):
         raise ValueError(f"{name} are different positions from 0 to {count - 1}, not {positions.tolist()}")
     return positions
+
+
+def _plain(plant: Plant, sensors: Array) -> Array:
+    """C (m, n_x) if y = C x whatever the command, the plant's own faults, disturbance, time and parameters; else (0, n_x).
+
+    Read off by unit steps, and compared with the plant at random points.
+    """
+    rng, n_x = np.random.default_rng(0), len(plant.states)
+    C = contiguous(plant.measure(0.0, np.eye(n_x), plant.trim_command)[:, sensors].T)
+    x = rng.standard_normal((16, n_x)) * [s.scale for s in plant.states]
+    u = plant.trim_command + rng.standard_normal((16, len(plant.commands)))
+    theta = np.tile(plant.nominal_theta, (16, 1))
+    theta[:, : plant.own_theta] += rng.standard_normal((16, plant.own_theta))
+    d, p = rng.standard_normal((16, len(plant.disturbances))), plant.nominal_p * rng.uniform(0.5, 2.0, (16, 1))
+    found = plant.measure(rng.uniform(0, 100, 16), x, u, theta, d, p)[:, sensors]
+    return C if np.allclose(found, x @ C.T, rtol=1e-9, atol=1e-9 * np.abs(found).max()) else C[:0]
 
 
 def _linear(plant: Plant, entries: Array) -> Array:

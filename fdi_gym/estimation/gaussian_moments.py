@@ -1,4 +1,4 @@
-"""What happens to one episode in the compiled Gaussian step: moments through f and h, and the correction.
+"""What happens to one episode in the compiled Gaussian step: moments through f and h.
 
 A function g (f or h of the augmented model) meets X ~ N(X, P) at 2 N + 1 points, the mean and two for each direction j.
 Half the difference of a pair over its step is first[j], its second difference second[j]; with them the three rules are
@@ -12,7 +12,8 @@ give the unscented transform with lambda = 2, h^2 = 3, a = (h^2 - 1) / (4 h^4), 
 [m; d] alone, so that their covariance stays and their covariance with the moved x is a part of cross.
 
 Vectors of an episode are rows in C order and inner loops run along them: that is what the compiler makes vectors of,
-in an order that no batch changes. Matrices are kept transposed (`first`, `cross`, the upper factor) for that reason.
+in an order that no batch changes. Matrices are kept transposed (`first`, `cross`, the upper factor) for that reason; W is
+what rows of N are as whole vectors.
 """
 
 from __future__ import annotations
@@ -22,9 +23,11 @@ import numpy as np
 from fdi_gym.estimation.gaussian_points import (
     DISTURBANCES,
     ENTRIES,
-    EXTENDED,
     KNOWN,
+    OUTPUT,
+    OUTPUTS,
     OWN,
+    SENSORS,
     SIZES,
     STATES,
     SUBSTEPS,
@@ -38,71 +41,155 @@ from fdi_gym.estimation.gaussian_points import (
     spread,
     squared_step,
 )
-from fdi_gym.kernels import helper
+from fdi_gym.kernels import helper, map_at
 from fdi_gym.tangent import tangent_at
 
-LOG_2PI = float(np.log(2.0 * np.pi))
-
 
 @helper
-def through_matrix(F, P, cross, cov):
-    """cross = F P and cov = F P F' for F (m, N), most of which may be 0."""
-    m, N = F.shape
-    for a in range(m):
-        for i in range(N):
-            cross[a, i] = 0.0
-        for j in range(N):
-            if F[a, j] != 0.0:
-                for i in range(N):
-                    cross[a, i] += F[a, j] * P[j, i]
-    for b in range(m):
-        for a in range(b, m):
-            cov[a, b] = 0.0
-        for j in range(N):
-            if F[b, j] != 0.0:
-                for a in range(b, m):
-                    cov[a, b] += cross[a, j] * F[b, j]
-        for a in range(b, m):
-            cov[b, a] = cov[a, b]
-
-
-@helper
-def through(rule, moving, integers, reals, step, offset, direction, t, X, P, u, known, mean, cross, cov):
-    """N(X, P) through f (moving) or h: mean (m,), cov (m, m) and cross (m, N) with what went in."""
+def through(rule, moving, integers, reals, offset, direction, t, X, P, u, known, mean, cross, cov):
+    """N(X, P) through f (moving) or h at points: mean (m,), cov (m, m) and cross (m, N) with what went in."""
     N, m = X.size, mean.size
     points, values = np.empty((2 * N + 1, N)), np.empty((2 * N + 1, m))
-    if rule != EXTENDED:
-        U, first = np.empty((N, N)), np.empty((N, m))
-        factor(P, U)
-        spread(X, U, np.sqrt(squared_step(rule, N)), points)
-        pass_points(moving, integers, reals, offset, direction, t, points, u, known, values)
-        low = integers[STATES] if moving else 0  # of f, nobody asks for the covariance with x before
-        moments_of_points(rule, U, low, values, first, mean, cross, cov)
-        return
-    moved = 0  # columns that are not 0
+    U, first = np.empty((N, N)), np.empty((N, m))
+    factor(P, U)
+    spread(X, U, np.sqrt(squared_step(rule, N)), points)
+    pass_points(moving, integers, reals, offset, direction, t, points, u, known, values)
+    low = integers[STATES] if moving else 0  # of f, nobody asks for the covariance with x before
+    moments_of_points(rule, U, low, values, first, mean, cross, cov)
+
+
+@helper
+def differenced(integers, reals, step, offset, direction, t, X, u, known, F, mean):
+    """mean = f(X) and F (n_x, W) its Jacobian, by central differences."""
+    N, m, moved = X.size, mean.size, 0  # so many columns are not 0
+    points, values = np.empty((2 * N + 1, N)), np.empty((2 * N + 1, m))
     for j in range(N):
-        if enters(moving, integers, direction, j):
+        if enters(True, integers, direction, j):
             for i in range(N):
                 points[1 + 2 * moved, i] = points[2 + 2 * moved, i] = X[i]
             points[1 + 2 * moved, j] += step[j]
             points[2 + 2 * moved, j] -= step[j]
             moved += 1
     points[0] = X
-    pass_points(moving, integers, reals, offset, direction, t, points[: 1 + 2 * moved], u, known, values)
-    F, moved = np.zeros((m, N)), 0
+    pass_points(True, integers, reals, offset, direction, t, points[: 1 + 2 * moved], u, known, values)
+    moved = 0
     for j in range(N):
-        if enters(moving, integers, direction, j):
+        for a in range(m):
+            F[a, j] = 0.0
+        if enters(True, integers, direction, j):
             for a in range(m):
                 F[a, j] = (values[1 + 2 * moved, a] - values[2 + 2 * moved, a]) * (0.5 / step[j])
             moved += 1
     for a in range(m):
         mean[a] = values[0, a]
-    through_matrix(F, P, cross, cov)
+
+
+@helper
+def put_magnitude(integers, offset, direction, X, f, reals, now):
+    """As `put_magnitudes`, the entries that magnitude f moves alone."""
+    n_x = integers[STATES]
+    for e in range(integers[ENTRIES]):
+        if direction[e, f] != 0.0:
+            deviation = offset[e]
+            for j in range(direction.shape[1]):
+                deviation += direction[e, j] * X[n_x + j]
+            now[integers[SIZES + e]] = reals[1 + integers[SIZES + e]] + deviation
+
+
+@helper
+def sensed(integers, reals, step, offset, direction, t, X, u, known, room, x, y, F, mean):
+    """mean = h(X) and F (m, W) its Jacobian, by central differences, one column after the other.
+
+    room: as of `room_of`; x (N,) and y (n_y,) are room too.
+    """
+    now, theta, physical, d = room[:4]
+    state = x[: integers[STATES]]
+    output = map_at(integers[OUTPUT])
+    n_x, n_m, m, N = integers[STATES], direction.shape[1], mean.size, X.size
+    p, own, n_y, n_d = integers[ENTRIES], integers[OWN], integers[OUTPUTS], integers[DISTURBANCES]
+    for i in range(N):
+        x[i] = X[i]
+    for i in range(d.size):
+        d[i] = known[i]
+    put_magnitudes(integers, offset, direction, X, reals[1:], now)
+    for j in range(-1, N):  # first the mean
+        if j >= n_x and not enters(False, integers, direction, j):
+            for a in range(m):
+                F[a, j] = 0.0
+            continue
+        for side in range(2 if j >= 0 else 1):
+            if j >= 0:
+                x[j] = X[j] + step[j] if side == 0 else X[j] - step[j]
+            if n_x <= j < n_x + n_m:
+                put_magnitude(integers, offset, direction, x, j - n_x, reals, now)
+            for i in range(n_d):
+                d[integers[SIZES + p + i]] = x[n_x + n_m + i]
+            output(t, state, u, theta, d, physical, y)
+            for a in range(m):
+                i = integers[SIZES + p + n_d + a]
+                value = y[i]
+                if own < integers[THETA]:  # gains, then biases
+                    value += y[i] * now[own + i] + now[own + n_y + i]
+                if j < 0:
+                    mean[a] = value
+                elif side == 0:
+                    F[a, j] = value
+                else:
+                    F[a, j] = (F[a, j] - value) * (0.5 / step[j])
+        if j >= 0:
+            x[j] = X[j]
+        if n_x <= j < n_x + n_m:
+            put_magnitude(integers, offset, direction, x, j - n_x, reals, now)
+
+
+@helper
+def own_faults(integers):
+    """Which entries are the gain and the bias of each sensor (2, m); -1 where none is."""
+    p, m, own, n_y = integers[ENTRIES], integers[SENSORS], integers[OWN], integers[OUTPUTS]
+    found = np.full((2, m), -1)
+    for a in range(m):
+        i = own + integers[SIZES + p + integers[DISTURBANCES] + a]
+        for e in range(p):
+            if own < integers[THETA] and integers[SIZES + e] == i:
+                found[0, a] = e
+            elif own < integers[THETA] and integers[SIZES + e] == i + n_y:
+                found[1, a] = e
+    return found
+
+
+@helper
+def heard(integers, reals, faults, offset, direction, plain, X, F, mean):
+    """mean = h(X) and F (m, W) its Jacobian, of sensors that read plain x, times their gain, and their bias.
+
+    faults: as of `own_faults`.
+    """
+    n_x, n_m = integers[STATES], direction.shape[1]
+    for a in range(mean.size):
+        y = 0.0
+        for j in range(n_x):
+            y += plain[a, j] * X[j]
+        for j in range(n_x, X.size):
+            F[a, j] = 0.0
+        gain = bias = 0.0
+        for of in range(2):
+            e = faults[of, a]
+            if e >= 0:
+                deviation = reals[1 + integers[SIZES + e]] + offset[e]
+                for j in range(n_m):
+                    deviation += direction[e, j] * X[n_x + j]
+                    F[a, n_x + j] += direction[e, j] * (y if of == 0 else 1.0)
+                if of == 0:
+                    gain = deviation
+                else:
+                    bias = deviation
+        for j in range(n_x):
+            F[a, j] = plain[a, j] * (1.0 + gain)
+        mean[a] = y + (y * gain + bias)
 
 
 @helper
 def linearised(integers, offset, direction, plant, X, u, known, F, mean):
-    """mean = f(X) and F (n_x, N) its Jacobian, for a plant x+ = g + A x + B u + G d + (E[0] + sum u_k E[1 + k]) dtheta.
+    """mean = f(X) and F (n_x, W) its Jacobian, for a plant x+ = g + A x + B u + G d + (E[0] + sum u_k E[1 + k]) dtheta.
 
     plant (n_x, ...) has the columns [g, A, B, G, E[0], E[1], ...].
     """
@@ -131,26 +218,32 @@ def linearised(integers, offset, direction, plant, X, u, known, F, mean):
             i = integers[SIZES + p + j]
             F[a, n_x + n_m + j] = plant[a, G + i]
             mean[a] -= plant[a, G + i] * known[i]  # X has it
-        for j in range(F.shape[1]):
+        for j in range(X.size):
             mean[a] += F[a, j] * X[j]
 
 
 @helper
-def differentiated(integers, reals, step, offset, direction, t, X, u, known, F, mean):
-    """mean = f(X) and F (n_x, N) its Jacobian, of a plant that says its derivatives."""
-    n, n_theta, own, n_D = integers[STATES], integers[THETA], integers[OWN], integers[KNOWN]
-    p, n_d, n_m, N = integers[ENTRIES], integers[DISTURBANCES], direction.shape[1], step.size
-    now, d = reals[1:].copy(), known.copy()
+def differentiated(integers, reals, step, offset, direction, t, X, u, known, room, F, mean):
+    """mean = f(X) and F (n_x, W) its Jacobian, of a plant that says its derivatives.
+
+    room: as of `room_of`.
+    """
+    now, theta, physical, d, L, used = room
+    n, own, n_D = integers[STATES], integers[OWN], integers[KNOWN]
+    n_theta, p, n_d, n_m, count = integers[THETA], integers[ENTRIES], integers[DISTURBANCES], direction.shape[1], 0
     put_magnitudes(integers, offset, direction, X, reals[1:], now)
-    n_p = now.size - n_theta
-    L, used, count = np.zeros((own + n_D + n_p, N)), np.empty(p + n_d, np.int64), 0
     for e in range(p):
         i = integers[SIZES + e]
         if i < own or i >= n_theta:  # else it is a fault of a sensor
-            used[count] = i if i < own else own + n_D + i - n_theta
+            at, moves = i if i < own else own + n_D + i - n_theta, False
             for j in range(n_m):
-                L[used[count], n + j] = direction[e, j]
-            count += 1
+                L[at, n + j] = direction[e, j]
+                moves = moves or direction[e, j] != 0.0
+            if moves:
+                used[count] = at
+                count += 1
+    for j in range(n_D):
+        d[j] = known[j]
     for j in range(n_d):
         i = integers[SIZES + p + j]
         d[i] = X[n + n_m + j]
@@ -159,54 +252,16 @@ def differentiated(integers, reals, step, offset, direction, t, X, u, known, F, 
         count += 1
     for i in range(n):
         mean[i] = X[i]
-        for j in range(N):
-            F[i, j] = 1.0 if i == j else 0.0
-    tangent = tangent_at(integers[TANGENT])
-    J, work, k = np.empty(n * (n + own + n_D + n_p)), np.empty((3, n, N)), np.empty((5, n))
-    substeps = integers[SUBSTEPS]
-    tangent(t, reals[0], substeps, mean, u, now[:own], d, now[n_theta:], L, used[:count], step, F, J, work, k)
+        for j in range(F.shape[1]):
+            F[i, j] = 0.0
+        F[i, i] = 1.0
+    tangent_at(integers[TANGENT])(t, reals[0], integers[SUBSTEPS], mean, u, theta, d, physical, L, used[:count], step, F)
 
 
 @helper
-def correct_episode(X, P, y, seen, mean, S, cross, U, white, X1, P1, nu, S1):
-    """The Kalman correction of one episode by the sensors that reported: nu' S^-1 nu, and the log density of what they read.
-
-    A sensor that did not report has nu = 0, no covariance with anything and S = 1. S1 = U' U; `white` becomes U'^-1 nu
-    and cross (m, N) U'^-1 cross.
-    """
-    m, N = cross.shape
-    for a in range(m):
-        nu[a] = y[a] - mean[a] if seen[a] else 0.0
-        for b in range(m):
-            S1[a, b] = 0.5 * (S[a, b] + S[b, a]) if seen[a] and seen[b] else 0.0
-        if not seen[a]:
-            S1[a, a] = 1.0
-    factor(S1, U)
-    for i in range(N):
-        X1[i] = X[i]
-        for j in range(i + 1):
-            P1[i, j] = 0.5 * (P[i, j] + P[j, i])
-    distance, log = 0.0, 0.0
-    for a in range(m):
-        white[a] = nu[a]
-        if not seen[a]:
-            for i in range(N):
-                cross[a, i] = 0.0
-            continue
-        for b in range(a):
-            white[a] -= U[b, a] * white[b]
-            for i in range(N):
-                cross[a, i] -= U[b, a] * cross[b, i]
-        white[a] /= U[a, a]
-        for i in range(N):
-            cross[a, i] /= U[a, a]
-        for i in range(N):
-            X1[i] += white[a] * cross[a, i]
-            for j in range(i + 1):
-                P1[i, j] -= cross[a, i] * cross[a, j]
-        distance += white[a] * white[a]
-        log -= 0.5 * LOG_2PI + np.log(U[a, a])
-    for i in range(N):
-        for j in range(i):
-            P1[j, i] = P1[i, j]
-    return distance, log - 0.5 * distance
+def room_of(integers, reals, W):
+    """Room for theta and p, in one and apart, d, and deviations of all of them (-1, W) with which of those count."""
+    n_theta, own, n_D = integers[THETA], integers[OWN], integers[KNOWN]
+    now = reals[1:].copy()
+    L, used = np.zeros((own + n_D + now.size - n_theta, W)), np.empty(integers[ENTRIES] + integers[DISTURBANCES], np.int64)
+    return now, now[:own], now[n_theta:], np.empty(n_D), L, used

@@ -6,8 +6,15 @@ H. A. P. Blom, Y. Bar-Shalom, IEEE Transactions on Automatic Control 33(8), 1988
 from __future__ import annotations
 
 import numpy as np
+from numba import float64, void
 
+from fdi_gym.integration import LANES
+from fdi_gym.kernels import compiled
+from fdi_gym.model import contiguous
 from fdi_gym.plant import Array
+from fdi_gym.vectors import load, minus, plus, store, width, zeros
+
+M3, M4 = float64[:, :, ::1], float64[:, :, :, ::1]
 
 
 def ahead(mu: Array, transition: Array) -> tuple[Array, Array]:
@@ -22,11 +29,42 @@ def ahead(mu: Array, transition: Array) -> tuple[Array, Array]:
 
 def mixture(w: Array, X: Array, P: Array) -> tuple[Array, Array]:
     """Mean (n, to, N) and covariance (n, to, N, N) of the mixtures of X (n, from, N), P (n, from, N, N), spread included."""
-    n, L, N = X.shape
-    mean = w @ X
-    spread = X[:, None] - mean[:, :, None]  # (n, to, from, N)
-    mixed = (w @ P.reshape(n, L, N * N)).reshape(n, -1, N, N)
-    return mean, mixed + np.swapaxes(w[..., None] * spread, 2, 3) @ spread
+    n, _, N = X.shape
+    mean, mixed = np.empty((n, w.shape[1], N)), np.empty((n, w.shape[1], N, N))
+    _mixture(contiguous(w), contiguous(X), contiguous(P), mean, mixed)
+    return mean, mixed
+
+
+@compiled(void(M3, M3, M4, M3, M4))
+def _mixture(w, X, P, mean, mixed):
+    (n, L, N), to = X.shape, w.shape[1]
+    W = width(N)
+    points, wide = np.zeros((L + 1, W)), np.zeros((L * N, W))  # rows in whole vectors; the last point is the mean
+    spread, total = np.empty((L, W)), np.empty((1, W))
+    for e in range(n):
+        for i in range(L):
+            for r in range(N):
+                points[i, r] = X[e, i, r]
+                for c in range(r + 1):
+                    wide[i * N + r, c] = P[e, i, r, c]
+        for j in range(to):
+            for c in range(0, W, LANES):
+                found = zeros()
+                for i in range(L):
+                    found = plus(found, w[e, j, i], load(points, i, c))
+                store(points, L, c, found)
+                for i in range(L):
+                    store(spread, i, c, minus(load(points, i, c), 1.0, found))
+            for r in range(N):
+                mean[e, j, r] = points[L, r]
+                for c in range(0, r + 1, LANES):
+                    within, between = zeros(), zeros()
+                    for i in range(L):
+                        within = plus(within, w[e, j, i], load(wide, i * N + r, c))
+                        between = plus(between, w[e, j, i] * spread[i, r], load(spread, i, c))
+                    store(total, 0, c, plus(within, 1.0, between))
+                for c in range(r + 1):
+                    mixed[e, j, r, c] = mixed[e, j, c, r] = total[0, c]
 
 
 def over_lines(w: Array, offset: Array, direction: Array, m: Array, M: Array) -> tuple[Array, Array]:
@@ -56,10 +94,7 @@ def mix(w: Array, X: Array, P: Array, own: slice, m0: Array, M0: Array) -> tuple
     L, N = X.shape[1:]
     stays = w[:, range(L), range(L)]  # that the model was in force before
     rest = [i for i in range(N) if not own.start <= i < own.stop]
-    others, P_rest = X.copy(), P.copy()
-    others[..., own] = 0.0
-    P_rest[..., own, :] = P_rest[..., :, own] = 0.0
-    mean, mixed = mixture(w, others, P_rest)
+    mean, mixed = mixture(w, X, P)
     m = X[..., own]
     mean[..., own] = stays[..., None] * m + (1 - stays[..., None]) * m0
     gap, a = m - m0, stays[..., None, None]
