@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from fdi_gym.data_sheet import FaultMode, Signal
     from fdi_gym.plant import Plant
 
+MOST = 128  # states, or signals of a kind, of a plant with equations: kernels keep vectors and matrices of them on the stack
 X0_RANGES = 10.0  # an initial state lies within so many times its declared range
 
 
@@ -88,6 +89,8 @@ def _wrong(plant: Plant) -> Iterable[str]:
             yield f"{role} is a function, not {getattr(plant, role)!r}"
     for role in ("states", "outputs", "commands", "known", "disturbances", "theta", "estimated"):
         yield from _wrong_signals(role, getattr(plant, role))
+        if kernels is not None and plant.bare is None and len(getattr(plant, role)) > MOST:
+            yield f"a plant with equations has at most {MOST} {role}, not {len(getattr(plant, role))}"
     for parts in plant.quaternions:
         if len(set(parts)) != 4 or len(parts) != 4 or not all(is_whole(i) and 0 <= i < len(plant.outputs) for i in parts):
             yield f"quaternions are four different positions among the {len(plant.outputs)} outputs each, not {parts!r}"

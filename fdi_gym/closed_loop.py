@@ -13,9 +13,23 @@ from __future__ import annotations
 import numpy as np
 from numba import float64, int64, uint64, void
 
-from fdi_gym.effects import AGAIN, FAULTS, at, caught, page_of, pointer, row_of, sense, theta_over, wrong_sensors
+from fdi_gym.effects import AGAIN, FAULTS, caught, sense, theta_over, wrong_sensors
 from fdi_gym.integration import FEW, LANES, interval_at, lanes_at
-from fdi_gym.kernels import M, V, compiled, control_at, helper, known_at, map_at, outside_at
+from fdi_gym.kernels import (
+    M,
+    V,
+    bools,
+    compiled,
+    control_at,
+    floats,
+    floats_at,
+    helper,
+    ints,
+    known_at,
+    map_at,
+    outside_at,
+    words,
+)
 from fdi_gym.noise import white
 
 TILE = 32  # samples that flights fly before the turn of the next ones
@@ -52,12 +66,11 @@ def _move(interval, lanes, dt, substeps, t, x, u, theta, d, p, courses, drifts, 
     for i in range(LANES):
         if not moving[i]:
             continue
-        now = row_of(THETA, beside[i])
+        now = THETA[beside[i]]
         if together < FEW or drifts[i]:
             for j in range(x.shape[1]):
                 after[i, j] = x[i, j]
-            course = page_of(courses, i)
-            interval(t[i], dt, substeps, drifts[i], row_of(after, i), row_of(u, i), course, row_of(d, i), row_of(p, i), now)
+            interval(t[i], dt, substeps, drifts[i], after[i], u[i], courses[i], d[i], p[i], now)
         else:
             for j in range(now.size):
                 now[j] = theta[i, j]
@@ -67,7 +80,7 @@ def _move(interval, lanes, dt, substeps, t, x, u, theta, d, p, courses, drifts, 
 def _injected(k, last, samples, process_noise, sensor_noise, n_y, noise):
     """The noise of samples from k on, from a flight's own tables."""
     n = noise.shape[1] - n_y
-    w, v = at(pointer(process_noise), (last, n), float64), at(pointer(sensor_noise), (last + 1, n_y), float64)
+    w, v = floats_at(process_noise, (last, n)), floats_at(sensor_noise, (last + 1, n_y))
     for s in range(min(samples, last + 1 - k)):
         for j in range(n_y):
             noise[s, j] = v[k + s, j]
@@ -110,18 +123,22 @@ def fly(
     n_r, n_d, own, healthy = widths[0], widths[1], widths[2], widths[3] != 0
     layered, tabled, reports = own < n_theta, sensors.shape[0] > 0, reporting.shape[0] > 0
     # of the flights side by side: what the plant's equations get, the course of theta, which they are
-    t, x, u, d = np.zeros(LANES), np.zeros((LANES, n)), np.zeros((LANES, n_u)), np.zeros((LANES, n_d))
-    p, theta_k, after = np.zeros((LANES, n_p)), np.zeros((LANES, n_theta)), np.zeros((LANES, n))
-    courses = np.zeros((LANES, 3, n_theta))
-    beside, segment, until = np.zeros(LANES, np.int64), np.zeros(LANES, np.int64), np.zeros(LANES, np.int64)
-    moving, drifts = np.zeros(LANES, np.bool_), np.zeros(LANES, np.bool_)
-    y, fed, r, wrong = np.empty(n_y), np.empty(n_y), np.empty(n_r), np.zeros((n_y, FAULTS))
-    used, words, noise = sigma > 0.0, np.empty((2, TILE), np.uint64), np.zeros((LANES, TILE, sigma.size))
+    t, x, u, d = floats(LANES), floats((LANES, n)), floats((LANES, n_u)), floats((LANES, n_d))
+    p, theta_k, after = floats((LANES, n_p)), floats((LANES, n_theta)), floats((LANES, n))
+    courses, beside, segment, until = floats((LANES, 3, n_theta)), ints(LANES), ints(LANES), ints(LANES)
+    moving, drifts = bools(LANES), bools(LANES)
+    y, fed, r, wrong = floats(n_y), floats(n_y), floats(n_r), floats((n_y, FAULTS))
+    used, pairs, noise = bools(sigma.size), words((2, TILE)), floats((LANES, TILE, sigma.size))
+    t[:], d[:], noise[:] = 0.0, 0.0, 0.0
+    for j in range(sigma.size):
+        used[j] = sigma[j] > 0.0
     for tile in range(0, samples, TILE):
         position, end = 0, min(tile + TILE, samples)
         while position < slots.size:
             width, position = _boarded(slots, position, status, beside)
-            for i in range(LANES if width else 0):
+            if width == 0:
+                break
+            for i in range(LANES):
                 slot = beside[i]
                 k, moving[i], segment[i] = sample[slot], i < width, 0
                 for j in range(n):
@@ -132,9 +149,9 @@ def fly(
                     p[i, j] = P[slot, j]
                 until[i] = theta_over(k, True, dt, slot, effects, counts, values, held, nominal, i, courses, drifts, theta_k)
                 if process_noise[slot]:
-                    _injected(k, steps[slot], end - tile, process_noise[slot], sensor_noise[slot], n_y, page_of(noise, i))
+                    _injected(k, steps[slot], end - tile, process_noise[slot], sensor_noise[slot], n_y, noise[i])
                 elif moving[i]:
-                    white(seed[slot], k, end - tile, sigma, limit, used, words, page_of(noise, i))
+                    white(seed[slot], k, end - tile, sigma, limit, used, pairs, noise[i])
             for s in range(tile, end):
                 row = first + s
                 for i in range(width):
@@ -144,8 +161,8 @@ def fly(
                     slot = beside[i]
                     k, last = sample[slot], steps[slot]
                     t[i] = k * dt
-                    references = at(pointer(reference_at[slot]), (last + 1, n_r), float64)
-                    disturbances = at(pointer(disturbance_at[slot]), (last + 1, n_d), float64)
+                    references = floats_at(reference_at[slot], (last + 1, n_r))
+                    disturbances = floats_at(disturbance_at[slot], (last + 1, n_d))
                     for j in range(n_r):
                         r[j] = references[k * reference_step[slot], j]
                     if references_added.shape[0]:
@@ -157,19 +174,19 @@ def fly(
                         until[i] = theta_over(
                             k, True, dt, slot, effects, counts, values, held, nominal, i, courses, drifts, theta_k
                         )
-                    acts, faulty = row_of(theta_k, i), tabled or reports or (layered and counts[slot] > 0)
-                    output(t[i], row_of(x, i), row_of(u, i), acts[:own], row_of(d, i), row_of(p, i), y)
+                    acts, faulty = theta_k[i], tabled or reports or (layered and counts[slot] > 0)
+                    output(t[i], x[i], u[i], acts[:own], d[i], p[i], y)
                     if faulty:
                         wrong_sensors(k, s, slot, sensors, acts, own, reporting, seed, dropped, wrong)
-                    seen = row_of(obs, row * obs.shape[1] + slot)
-                    again, errors = reports and reporting[slot, 0, AGAIN] != 0.0, row_of(page_of(noise, i), s - tile)
+                    seen = obs[row, slot]
+                    again, errors = reports and reporting[slot, 0, AGAIN] != 0.0, noise[i, s - tile]
                     sense(
                         k, y, errors, faulty, wrong, again, true_feedback != 0, healthy, sensor_box,
-                        page_of(histories, slot), page_of(readings, slot), seen, fed,
+                        histories[slot], readings[slot], seen, fed,
                     )  # fmt: skip
                     for j in range(n_u):
                         seen[n_y + j] = u[i, j]
-                    known(t[i], r, row_of(C, slot), seen[n_y + n_u :])
+                    known(t[i], r, C[slot], seen[n_y + n_u :])
                     while labels[slot, segment[i] + 1, 0] <= k:
                         segment[i] += 1
                     label[row, slot] = labels[slot, segment[i], 1]
@@ -182,7 +199,7 @@ def fly(
                         steps[slot], moving[i] = k, False
                         continue
                     # step k: the command
-                    control(t[i], fed, r, row_of(parameters, slot), row_of(C, slot), row_of(u, i))
+                    control(t[i], fed, r, parameters[slot], C[slot], u[i])
                     if inputs.shape[0]:
                         for j in range(n_u):
                             if inputs[s, slot, j]:
@@ -206,10 +223,10 @@ def fly(
                         for j in range(n):
                             x[i, j] = after[i, j]
                     sample[slot] = k + 1
-                    references = at(pointer(reference_at[slot]), (steps[slot] + 1, n_r), float64)
+                    references = floats_at(reference_at[slot], (steps[slot] + 1, n_r))
                     for j in range(n_r):
                         r[j] = references[(k + 1) * reference_step[slot], j]
-                    if not finite or outside(t[i] + dt, row_of(x, i), r):
+                    if not finite or outside(t[i] + dt, x[i], r):
                         status[slot] = ENDED
             for i in range(width):
                 for j in range(n):

@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import numba
 import numpy as np
-from numba import float64, int64, types
-from numba.core import cgutils
-from numba.extending import intrinsic
 
-from fdi_gym.kernels import helper, inlined
+from fdi_gym.kernels import floats_at, helper
 from fdi_gym.noise import uniform
 
 # Columns of a flight's table of effects: entry of theta, first and end step, kind, and what the kind needs
@@ -27,31 +21,6 @@ BEGIN, STAY, PERIOD, DELAY, AGAIN, REPORTING = range(6)
 NEVER = 2**62  # a sample that does not come
 
 
-def _pointer_at(typing_context, where):
-    def codegen(context, builder, _, arguments):
-        return builder.inttoptr(arguments[0], cgutils.voidptr_t)
-
-    return types.voidptr(int64), codegen
-
-
-pointer: Any = intrinsic(_pointer_at)  # a pointer from an address
-at: Any = numba.carray  # type: ignore[attr-defined]  # the array there
-
-
-@inlined
-def row_of(table, i):
-    """Row i of a table, without counting who refers to it (which costs more than to read it): the table outlives it."""
-    n = table.shape[-1]
-    return at(pointer(table.ctypes.data + 8 * i * n), (n,), float64)
-
-
-@inlined
-def page_of(tables, i):
-    """Table i of so many, in the same way."""
-    rows, n = tables.shape[-2], tables.shape[-1]
-    return at(pointer(tables.ctypes.data + 8 * i * rows * n), (rows, n), float64)
-
-
 @helper
 def theta_over(k, seen, dt, slot, effects, counts, values, held, nominal, i, courses, drifts, theta):
     """theta over step k, tau after sample k, from the effects on flight `slot` that act then; of two, the later listed.
@@ -62,8 +31,7 @@ def theta_over(k, seen, dt, slot, effects, counts, values, held, nominal, i, cou
     `seen`: as the sensors meet it at sample k, before the command of step k is known.
     Returns the next step at which to ask again.
     """
-    table, course = page_of(effects, slot), page_of(courses, i)
-    a, b, g = row_of(course, 0), row_of(course, 1), row_of(course, 2)
+    table, a, b, g = effects[slot], courses[i, 0], courses[i, 1], courses[i, 2]
     for j in range(a.size):
         a[j], b[j], g[j] = nominal[j], 0.0, 0.0
     drifts[i], until = False, NEVER
@@ -96,7 +64,7 @@ def theta_over(k, seen, dt, slot, effects, counts, values, held, nominal, i, cou
             a[j] = value if half % 2.0 == 0.0 else table[e, SECOND]
         elif kind == SAMPLES:
             last = np.int64(table[e, FIRST]) - 1
-            a[j] = at(pointer(values[slot, e]), (last + 1,), float64)[min(k - onset, last)]
+            a[j] = floats_at(values[slot, e], last + 1)[min(k - onset, last)]
         elif seen and k == onset:
             a[j] = nominal[j]
         else:
@@ -123,7 +91,7 @@ def caught(k, slot, effects, counts, u, i, held):
 @helper
 def wrong_sensors(k, s, slot, sensors, theta, own, tables, seed, drops, f):
     """f (n_y, FAULTS): what is wrong with each sensor of flight `slot` at sample k, from all who have a say."""
-    n_y, reporting, dropped = f.shape[0], page_of(tables, slot), row_of(drops, slot)
+    n_y, reporting, dropped = f.shape[0], tables[slot], drops[slot]
     tabled, layered, reports = sensors.shape[0] > 0, own < theta.size, tables.shape[0] > 0
     for i in range(n_y):
         for c in range(FAULTS):
@@ -142,7 +110,7 @@ def wrong_sensors(k, s, slot, sensors, theta, own, tables, seed, drops, f):
                 f[i, MISSING] += dropped[i]
 
 
-@inlined
+@helper
 def sense(k, y, noise, faulty, f, again, true_feedback, healthy, box, history, last, shown, fed):
     """What the sensors say: `shown` (NaN where one does not report), and `fed`, what the controller gets.
     `last` has the last reading of each, and what it last fed; `again`: it is shown in place of NaN. `true_feedback`: the

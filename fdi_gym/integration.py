@@ -5,16 +5,16 @@ from typing import Any
 import numpy as np
 from numba import boolean, float64, int64, void
 
-from fdi_gym.kernels import M, V, around, compiled, function_at, inlined, map_at, stack
+from fdi_gym.kernels import M, V, around, compiled, floats, function_at, helper, inside, map_at, stack
 
 
-@inlined
+@helper
 def _copy(table, i, other, j):
     for a in range(other.shape[1]):
         other[j, a] = table[i, a]
 
 
-@inlined
+@inside
 def _theta_at(tau, a, b, g, theta):
     for j in range(theta.size):
         if b[j] == 0.0:
@@ -169,11 +169,12 @@ def propagate(interval_address, lanes_address, dt, substeps, t, x, u, theta, d, 
     """out[i] = the state one sample after x[i]; t, u, theta, d, p have m rows that serve M/m consecutive points each."""
     interval, lanes = interval_at(interval_address), lanes_at(lanes_address)
     points, n = x.shape
-    T, X, U, THETA = np.empty(LANES), np.empty((LANES, n)), np.empty((LANES, u.shape[1])), np.empty((LANES, theta.shape[1]))
-    D, P = np.empty((LANES, d.shape[1])), np.empty((LANES, p.shape[1]))
-    course, theta_now = np.zeros((3, theta.shape[1])), np.empty(theta.shape[1])
+    T, X, U, THETA = floats(LANES), floats((LANES, n)), floats((LANES, u.shape[1])), floats((LANES, theta.shape[1]))
+    D, P = floats((LANES, d.shape[1])), floats((LANES, p.shape[1]))
+    course, theta_now = floats((3, theta.shape[1])), floats(theta.shape[1])
     every_t, every_u, every_theta = points // t.size, points // u.shape[0], points // theta.shape[0]
     every_d, every_p = points // d.shape[0], points // p.shape[0]
+    course[1:] = 0.0
     for first in range(0, points, LANES):
         count = min(LANES, points - first)
         for lane in range(LANES):
@@ -188,7 +189,7 @@ def propagate(interval_address, lanes_address, dt, substeps, t, x, u, theta, d, 
             lanes(T, dt, substeps, X, U, THETA, D, P, X)
         else:
             for lane in range(count):
-                course[0] = THETA[lane]
+                _copy(THETA, lane, course, 0)
                 interval(T[lane], dt, substeps, False, X[lane], U[lane], course, D[lane], P[lane], theta_now)
         for lane in range(count):
             _copy(X, lane, out, first + lane)
@@ -199,8 +200,8 @@ def evaluate(function_address, t, x, u, theta, d, p, out):
     """out[i] = function(t, x[i], ...): the sensors' values or the state's rate of change, rows served as in `propagate`."""
     function = map_at(function_address)
     points = x.shape[0]
-    xi, ui, ti = np.empty(x.shape[1]), np.empty(u.shape[1]), np.empty(theta.shape[1])
-    di, pi, oi = np.empty(d.shape[1]), np.empty(p.shape[1]), np.empty(out.shape[1])
+    xi, ui, ti = floats(x.shape[1]), floats(u.shape[1]), floats(theta.shape[1])
+    di, pi, oi = floats(d.shape[1]), floats(p.shape[1]), floats(out.shape[1])
     every_t, every_u, every_theta = points // t.size, points // u.shape[0], points // theta.shape[0]
     every_d, every_p = points // d.shape[0], points // p.shape[0]
     for i in range(points):

@@ -36,9 +36,10 @@ from typing import Any
 
 import numba
 from llvmlite import ir
-from numba import boolean, float64, int64, types, void
+from numba import boolean, float64, int64, types, uint64, void
 from numba.core import cgutils, config
 from numba.extending import intrinsic
+from numba.np.arrayobj import populate_array
 
 from fdi_gym.kernel_cache import Cache, cache_folder, name_around
 
@@ -62,30 +63,33 @@ _ROLES = {
 
 
 _carray: Any = numba.carray  # type: ignore[attr-defined]  # the array at a pointer
-njit: Any = numba.njit  # what only kernels call needs no way in from Python or C, slow to compile: `helper`, `inlined`
-helper = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
-inlined = njit(error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+njit: Any = numba.njit
+# What only generic kernels call: no way in from Python or C, slow to compile, and, as these themselves, no array of its own
+# but on the stack (`floats`, `ints`, `bools`): to count who refers to an array costs more than to look into it
+helper = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
+inlined = njit(error_model="numpy", inline="always")  # becomes a part of its caller: it may make what that works with
+inside = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True)  # an author's own
 
 _signatures: dict[Any, Any] = {}  # of the kernels, compiled when they are first needed
 _announced: set[str] = set()  # source files whose cold compilation has been announced
 _compiling = threading.RLock()
 
 
-def _lazily(function: Callable[..., Any], signature: Any, inside: tuple[Any, ...] = ()) -> Any:
+def _lazily(function: Callable[..., Any], signature: Any, within: tuple[Any, ...] = (), heap: bool = True) -> Any:
     """The function as numba's dispatcher, cached in the folder of its sources; nothing is compiled yet.
 
-    `inside`: kernels of a plant that are compiled into it. It then lies with the first of them.
+    `within`: kernels of a plant that are compiled into it. It then lies with the first of them.
     """
-    folder = cache_folder((inside[0].py_func if inside else function).__code__.co_filename)
-    if not all(isinstance(k._cache, Cache) for k in inside):
+    folder = cache_folder((within[0].py_func if within else function).__code__.co_filename)
+    if not all(isinstance(k._cache, Cache) for k in within):
         folder = None
-    dispatcher = njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True)(function)
+    dispatcher = njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True, _nrt=heap)(function)
     if folder is not None:
         settings: Any = config
         before = settings.CACHE_DIR
         settings.CACHE_DIR = str(folder)
         try:
-            dispatcher._cache = Cache(function, inside)  # type: ignore[attr-defined]
+            dispatcher._cache = Cache(function, within)  # type: ignore[attr-defined]
         except (RuntimeError, OSError):  # numba finds no place for it
             pass
         finally:
@@ -126,11 +130,14 @@ def kernel(function: Callable[..., Any]) -> Any:
     return _lazily(function, role)
 
 
-def compiled(signature: Any) -> Callable[[Any], Any]:
-    """Make a generic kernel: compiled for this signature at its first call, cached; it runs without the GIL."""
+def compiled(signature: Any, heap: bool = False) -> Callable[[Any], Any]:
+    """Make a generic kernel: compiled for this signature at its first call, cached; it runs without the GIL.
+
+    `heap`: it makes arrays, or calls of NumPy what does.
+    """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher = _lazily(function, signature)
+        dispatcher = _lazily(function, signature, heap=heap)
         dispatcher._compile_for_args = lambda *_: load(dispatcher)  # numba asks this where nothing fits, and calls it
         return dispatcher
 
@@ -143,7 +150,7 @@ def around(make: Callable[..., Any], signature: Any, *kernels: Any, sizes: tuple
 
     `sizes`, if any, come first in what `make` gets; it may compile them in.
     """
-    function = make(*((sizes,) if sizes else ()), *(inlined(k.py_func) for k in kernels))
+    function = make(*((sizes,) if sizes else ()), *(inside(k.py_func) for k in kernels))
     function.__qualname__ = "_".join([function.__name__, *map(str, sizes), name_around(make, *kernels)])
     return _lazily(function, signature, kernels)
 
@@ -162,11 +169,53 @@ def stack(*shape: int) -> Any:
 
     _room: Any = intrinsic(_room_at)
 
-    @inlined
+    @inside
     def array():
         return _carray(_room(), shape)
 
     return array
+
+
+def _array(dtype: Any, given: bool) -> Any:
+    """An intrinsic that makes an array that nobody counts: at an address, or uninitialised on its caller's stack.
+
+    On the stack it lives as long as its caller, who must not ask for it in a loop.
+    """
+
+    def typed(shape: Any) -> tuple[Any, Any]:
+        many = isinstance(shape, types.BaseTuple)
+        extents = types.UniTuple(types.intp, len(shape)) if many else types.intp
+        return types.Array(dtype, len(shape) if many else 1, "C"), extents
+
+    def made(context, builder, kind, extents, shape, address):
+        shape = [shape] if extents is types.intp else list(cgutils.unpack_tuple(builder, shape))
+        item = context.get_data_type(dtype)
+        size = context.get_constant(types.intp, context.get_abi_sizeof(item))
+        strides, count = [size], shape[0]
+        for extent in shape[:0:-1]:
+            strides.insert(0, builder.mul(strides[0], extent))
+        for extent in shape[1:]:
+            count = builder.mul(count, extent)
+        data = builder.alloca(item, count) if address is None else builder.inttoptr(address, item.as_pointer())
+        array = context.make_array(kind)(context, builder)
+        populate_array(array, data=data, shape=shape, strides=strides, itemsize=size, meminfo=None)
+        return array._getvalue()
+
+    @intrinsic
+    def array_at(typing_context, address, shape):
+        kind, extents = typed(shape)
+        return kind(types.intp, extents), lambda c, b, _, args: made(c, b, kind, extents, args[1], args[0])
+
+    @intrinsic
+    def array(typing_context, shape):
+        kind, extents = typed(shape)
+        return kind(extents), lambda c, b, _, args: made(c, b, kind, extents, args[0], None)
+
+    return array_at if given else array
+
+
+floats, ints, words, bools = (_array(dtype, False) for dtype in (float64, int64, uint64, boolean))
+floats_at = _array(float64, True)
 
 
 class Sent:

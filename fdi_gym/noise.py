@@ -14,9 +14,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numba import uint64
+
+from fdi_gym.kernels import helper, inlined
 
 M0, M1 = uint64(0xD2511F53), uint64(0xCD9E8D57)  # multipliers of Philox4x32
 W0, W1 = uint64(0x9E3779B9), uint64(0xBB67AE85)  # what the key grows by in each round
@@ -45,14 +46,14 @@ WITHIN, WIDTH, HEIGHT = ziggurat()
 SIDE = np.array([1.0, -1.0])
 
 
-@numba.njit(error_model="numpy", inline="always")
+@inlined
 def _round(c0, c1, c2, c3, k0, k1, i):
     p0, p1 = M0 * c0, M1 * c2
     k0, k1 = (k0 + uint64(i) * W0) & LOW, (k1 + uint64(i) * W1) & LOW
     return (p1 >> HALF) ^ c1 ^ k0, p1 & LOW, (p0 >> HALF) ^ c3 ^ k1, p0 & LOW
 
 
-@numba.njit(error_model="numpy", inline="always")
+@inlined
 def philox(c0, c1, c2, c3, k0, k1):
     """The four 32-bit words of a counter under a key, each in a uint64. Not a loop: so LLVM makes vectors of it."""
     c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1, 0)
@@ -67,7 +68,7 @@ def philox(c0, c1, c2, c3, k0, k1):
     return _round(c0, c1, c2, c3, k0, k1, 9)
 
 
-@numba.njit(error_model="numpy")
+@helper
 def _missed(word, sample, pair, which, k0, k1):
     """The normal of a word outside its layer's core: wedge, tail, or a new word."""
     attempt = uint64(0)
@@ -93,7 +94,7 @@ def _missed(word, sample, pair, which, k0, k1):
         word = c | (d << HALF)
 
 
-@numba.njit(error_model="numpy")
+@helper
 def fill(seed, start, samples, used, words, z):
     """z[s, j] = the normal of channel j at sample start + s, for the channels that are used; the others are left alone.
 
@@ -127,7 +128,7 @@ def fill(seed, start, samples, used, words, z):
                     z[s, j + which] = _missed(word, uint64(start + s) & LOW, uint64(pair), uint64(which), k0, k1)
 
 
-@numba.njit(error_model="numpy")
+@helper
 def white(seed, start, samples, sigma, limit, used, words, z):
     """z[s, j] = the noise of channel j at sample start + s, its normals within `limit`; 0 where the channel is not used."""
     fill(seed, start, samples, used, words, z)
@@ -136,7 +137,7 @@ def white(seed, start, samples, sigma, limit, used, words, z):
             z[s, j] = sigma[j] * min(max(z[s, j], -limit), limit)
 
 
-@numba.njit(error_model="numpy")
+@helper
 def uniform(seed, sample, channel):
     """A number in [0, 1) for a sample and a channel, apart from all noise."""
     a, b, _, _ = philox(uint64(sample) & LOW, APART + uint64(channel), uint64(0), uint64(0), seed & LOW, seed >> HALF)

@@ -1,8 +1,7 @@
 """Sine and cosine of an angle at once, for the equations of plants.
 
-Most of what a plant with attitudes or gimbals computes are sines and cosines, and a call of the C library's for each cost
-half of the time of such a flight. What is here is compiled into the equations. It is right to 1.6e-16, and the
-same on every processor.
+What is here is compiled into the equations; a call of the C library's would keep LLVM from making vectors of those of many
+points at once. It is right to 1.6e-16, and the same on every processor.
 
 The algorithm is fdlibm's (Sun Microsystems, 1993, s_sin.c, k_sin.c, k_cos.c; its coefficients): the angle less a multiple
 of pi/2, in three parts (Cody and Waite), then a polynomial for each of the two.
@@ -12,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fdi_gym.kernels import njit
+from fdi_gym.kernels import inlined
 
 EIGHTH = np.pi / 4
 PER_QUARTER = 6.36619772367581382433e-01  # 2 / pi
@@ -23,7 +22,7 @@ C1, C2, C3 = 4.16666666666666019037e-02, -1.38888888888741095749e-03, 2.48015872
 C4, C5, C6 = -2.75573143513906633035e-07, 2.08757232129817482790e-09, -1.13596475577881948265e-11
 
 
-@njit(error_model="numpy", inline="always")
+@inlined
 def sincos(x):
     """(sin x, cos x) of an angle x [rad]; kernels of plants may call it.
 

@@ -301,6 +301,7 @@ WRONG = {
     "low NaN": lambda p: {"theta": first(p.theta, low=NAN)},
     "nominal": lambda p: {"theta": first(p.theta, nominal=p.theta[0].high + 1)},
     "sigma": lambda p: {"outputs": first(p.outputs, sigma=-1.0)},
+    "at most": lambda p: {"states": tuple(p.states[0]._replace(name=f"x{i}") for i in range(129))},
     "two states": lambda p: {"states": (*p.states[:-1], p.states[0])},
     "two outputs": lambda p: {"outputs": (*p.outputs[:-1], p.outputs[0])},
     "two modes": lambda p: {"modes": (*p.modes, p.modes[0])},

@@ -5,7 +5,7 @@ from numba import float64, int64, void
 
 from fdi_gym.estimation.gaussian_points import UNSCENTED, factor, moments_of_points, spread, squared_step
 from fdi_gym.integration import LANES, lanes_at
-from fdi_gym.kernels import M, V, compiled, helper
+from fdi_gym.kernels import M, V, compiled, floats, helper
 
 M3 = float64[:, :, ::1]
 
@@ -27,15 +27,20 @@ def predict(lanes_address, dt, substeps, physical, X, P, sign, u, Q, X1, P1, sig
     lanes = lanes_at(lanes_address)
     (n, N), n_theta = X.shape, u.shape[1]
     n_x, count = N - n_theta + 1, 2 * N + 1
-    T, x, us, theta = np.zeros(LANES), np.empty((LANES, n_x)), np.empty((LANES, n_theta)), np.empty((LANES, n_theta))
-    d, p = np.empty((LANES, 0)), np.empty((LANES, physical.size))
-    U, points, values, first = np.empty((N, N)), np.empty((count, N)), np.empty((count, N)), np.empty((N, N))
-    mean, cross, cov = np.empty(N), np.empty((N, N)), np.empty((N, N))
-    p[:] = physical
+    T, x, us, theta = floats(LANES), floats((LANES, n_x)), floats((LANES, n_theta)), floats((LANES, n_theta))
+    d, p = floats((LANES, 0)), floats((LANES, physical.size))
+    U, points, values, first = floats((N, N)), floats((count, N)), floats((count, N)), floats((N, N))
+    mean, cross, cov = floats(N), floats((N, N)), floats((N, N))
+    T[:] = 0.0
+    for lane in range(LANES):
+        for j in range(physical.size):
+            p[lane, j] = physical[j]
     for e in range(n):
         factor(P[e], U)
         spread(X[e], U, np.sqrt(squared_step(UNSCENTED, N)), points)
-        us[:] = u[e]
+        for lane in range(LANES):
+            for j in range(n_theta):
+                us[lane, j] = u[e, j]
         for start in range(0, count, LANES):
             for lane in range(LANES):
                 i = min(start + lane, count - 1)

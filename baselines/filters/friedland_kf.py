@@ -14,14 +14,14 @@ from baselines.filters.two_stage_kf import TwoStage, decision_rule, initial_cova
 from baselines.filters.two_stage_kf import correct as two_stage_correct
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.estimation.linear import LinearModel, linear_model, stacked
-from fdi_gym.kernels import M, compiled
+from fdi_gym.kernels import M, compiled, floats
 from fdi_gym.plant import Array, Plant
 
 
 @compiled(void(M, M3, M3, M, M, M, M, M3, M3, M, M3, M3))
 def _predict(x, Px, V, u, A, B, E_0, E_u, Q, x1, Px1, V1):
     n, n_x, p = V.shape
-    E, APx = np.empty((n_x, p)), np.empty((n_x, n_x))
+    E, APx = floats((n_x, p)), floats((n_x, n_x))
     for k in range(n):
         sensitivity(E_0, E_u, u[k], E)
         product(A, V[k], V1[k])

@@ -7,7 +7,7 @@ import numpy as np
 from numba import boolean, float64, int64, void
 
 from fdi_gym.estimation.compiled import eliminate
-from fdi_gym.kernels import M, compiled, helper
+from fdi_gym.kernels import M, compiled, floats, helper
 
 M3, B2, I1 = float64[:, :, ::1], boolean[:, ::1], int64[::1]
 DIRECTIONAL, EXPONENTIAL = 1, 2
@@ -75,7 +75,7 @@ def symmetrise(P):
             P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
 
 
-@compiled(void(M3, int64, float64, float64, float64, float64, M3))
+@compiled(void(M3, int64, float64, float64, float64, float64, M3), heap=True)
 def forget(Pz, rule, factor, a_min, a_max, q, aged):
     """Pz (n, p, p) under forgetting, eigenvalue by eigenvalue (`two_stage_kf.forget`), and q more on its diagonal."""
     n, p, _ = Pz.shape
@@ -115,9 +115,9 @@ def predict(x, Px, z, Pz, V, Pz_minus, steady, u, A, B, E_0, E_u, Q, x1, Px1, V1
     """Over the interval under the command u, eqs. 24 to 31. `steady`: Pz_minus is Pz."""
     n, n_x, p = V.shape
     E, W, WPz, D, a, b = (
-        np.empty((n_x, p)), np.empty((n_x, p)), np.empty((n_x, p)), np.empty((n_x, p)), np.empty((p, p)), np.empty((p, n_x))
+        floats((n_x, p)), floats((n_x, p)), floats((n_x, p)), floats((n_x, p)), floats((p, p)), floats((p, n_x))
     )  # fmt: skip
-    APx, P = np.empty((n_x, n_x)), np.empty((n_x, n_x))
+    APx, P = floats((n_x, n_x)), floats((n_x, n_x))
     for k in range(n):
         sensitivity(E_0, E_u, u[k], E)
         product(A, V[k], W)
@@ -168,8 +168,8 @@ def correct(x, Px, z, Pz, V, y, seen, C, R, x1, Px1, z1, Pz1, V1, nu, S_z, count
     A sensor that did not report has residual 0, variance 1 and no covariance with anything: its row is gone.
     """
     (n, n_x, p), m = V.shape, y.shape[1]
-    r, H, CPx, HPz, S = np.empty(m), np.empty((m, p)), np.empty((m, n_x)), np.empty((m, p)), np.empty((m, m))
-    a, Kx, Kz = np.empty((m, m)), np.empty((m, n_x)), np.empty((m, p))  # gains, transposed
+    r, H, CPx, HPz, S = floats(m), floats((m, p)), floats((m, n_x)), floats((m, p)), floats((m, m))
+    a, Kx, Kz = floats((m, m)), floats((m, n_x)), floats((m, p))  # gains, transposed
     for k in range(n):
         product(C, V[k], H)
         product(C, Px[k], CPx)
@@ -215,7 +215,7 @@ def correct(x, Px, z, Pz, V, y, seen, C, R, x1, Px1, z1, Pz1, V1, nu, S_z, count
 def optimal(x, Px, z, Pz, V, X, P):
     """The optimal state estimate x + V z and its covariance Px + V Pz V', eqs. 40 and 41."""
     n, n_x, p = V.shape
-    VPz = np.empty((n_x, p))
+    VPz = floats((n_x, p))
     for k in range(n):
         product(V[k], Pz[k], VPz)
         product_with_transposed(VPz, V[k], P[k])

@@ -188,7 +188,7 @@ def classifier(
         featurise, score: The classifier.
     """
     stride = weights.whole_number(file, card, "stride", weights.SIZES["stride"])
-    expected = process if process in card.processes else card.processes[0]
+    expected = card.expected(process)
     own = weights.calibration_of(file, card, expected)
     bias, prior = np.array(own.bias), np.log(np.maximum(np.array(own.prior) / sum(own.prior), LEAST))
     index = card.processes.index(expected)

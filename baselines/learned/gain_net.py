@@ -223,7 +223,7 @@ def gain_net(plant: Plant, *, process: str = "standard", path: str = "") -> Diag
     stride = weights.whole_number(file, card, "stride", weights.SIZES["stride"])
     hidden = weights.whole_number(file, card, "hidden", weights.SIZES["hidden"])
     weights.check_tensors(file, tensors, tensor_shapes(plant, tensors, hidden, len(card.processes)))
-    expected = process if process in card.processes else card.processes[0]
+    expected = card.expected(process)
     try:
         nominal = nominal_of(plant, {name: a.astype(float) for name, a in tensors.items()}, stride)
     except NotApplicableError:

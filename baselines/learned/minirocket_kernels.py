@@ -5,11 +5,10 @@ A. Dempster, D. F. Schmidt, G. I. Webb, Proceedings of KDD 2021. A kernel has ni
 
 from __future__ import annotations
 
-import numpy as np
 from numba import boolean, float64, int64, void
 
 from fdi_gym.estimation.compiled import helper
-from fdi_gym.kernels import M, compiled
+from fdi_gym.kernels import M, compiled, floats
 
 I1, I2, B2, M3 = int64[::1], int64[:, ::1], boolean[:, ::1], float64[:, :, ::1]
 WEIGHTS = 9
@@ -43,7 +42,7 @@ def transform(x, dilations, triples, channels, bias, out):
     """
     n, _, L = x.shape
     kernels, biases = len(triples), bias.shape[1]
-    total, value = np.empty(L), np.empty(L)
+    total, value = floats(L), floats(L)
     for i in range(n):
         for d in range(len(dilations)):
             edge = WEIGHTS // 2 * dilations[d]
@@ -63,7 +62,7 @@ def transform(x, dilations, triples, channels, bias, out):
 def values(x, dilations, triples, channels, out):
     """The convolutions themselves, of window i: out[i, pair, t]."""
     n, _, L = x.shape
-    total = np.empty(L)
+    total = floats(L)
     for i in range(n):
         for d in range(len(dilations)):
             for k in range(len(triples)):

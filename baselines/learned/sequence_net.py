@@ -56,7 +56,7 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
     """
     plant.process(process)
     file, tensors, card = weights.find(method, plant, path)
-    expected = process if process in card.processes else card.processes[0]
+    expected = card.expected(process)
     shape, hidden = weights.shape_of(file, card)
     entries = diagnosers()
     for name in card.filters:  # never "module:function", which would be imported

@@ -108,6 +108,10 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     versions: dict[str, str]
     sha256: str = ""
 
+    def expected(self, process: str) -> str:
+        """The process that a method expects which is told this one: that, or the first where it was not trained on it."""
+        return process if process in self.processes else self.processes[0]
+
     def __post_init__(self) -> None:
         if not 1 <= len(self.processes) <= 100 or len(set(self.processes)) < len(self.processes):
             raise ValueError("weights are for 1 to 100 different processes")

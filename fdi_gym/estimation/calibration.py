@@ -28,6 +28,9 @@ class Persistence(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Consecutive samples until an alarm is raised, its label changes, and it is given up.
 
     `warmup` samples at first neither decide nor count. With `same` the samples must agree on the label too.
+
+    Raises:
+        ValueError: A length below 1.
     """
 
     rise: int = 3
@@ -35,6 +38,10 @@ class Persistence(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     release: int = 10
     warmup: int = -1
     same: bool = False
+
+    def __post_init__(self) -> None:
+        if min(self.rise, self.switch, self.release) < 1:
+            raise ValueError(f"rise, switch and release are at least one sample, not {self}")
 
 
 class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

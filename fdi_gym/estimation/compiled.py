@@ -3,7 +3,7 @@
 import numpy as np
 from numba import float64, void
 
-from fdi_gym.kernels import compiled, helper
+from fdi_gym.kernels import compiled, floats, helper
 
 
 @helper
@@ -41,7 +41,7 @@ def eliminate(a, b):
 def solve(A, B, out):
     """out[i] = A[i]^-1 B[i] for many small systems."""
     n, m, width = B.shape
-    a = np.empty((m, m))
+    a = floats((m, m))
     for i in range(n):
         for r in range(m):
             for c in range(m):

@@ -166,30 +166,11 @@ def glr(windows: tuple[int, ...] = (2, 5, 10, 20, 40)) -> Statistic:
 
 STATISTICS: dict[str, Callable[[], Statistic]] = {"chi-square": chi_square, "cusum": cusum, "glr": glr}
 DECISIONS = ("distance", "thresholds", *STATISTICS)
-SURE_AGAIN = 1.2  # times the variance before a gap
-PATIENCE, PER_GAP = 20, 2  # it waits for so many samples at most, and so many more for each without a report
 QUARTER = 0.25  # of a typical fault: what LEAST is in the fixed metric of "thresholds"
 
 
 # ---------------------------------------------------------------------------------------------------------------
 # Rules
-
-
-class Waiting(NamedTuple):
-    """For an estimate that is as sure again as it was before a gap, or does not become so any more."""
-
-    still: Array  # (n,) bool
-    variance: Array  # (n, p) of the estimate when a sensor last reported and nothing was waited for
-    patience: Array  # (n,) samples with reports for which it is waited at most
-
-    def after(self, informed: Array, variance: Array) -> Waiting:
-        """After a sample at which sensors reported or did not."""
-        if informed.all() and not self.still.any():
-            return Waiting(self.still, variance, self.patience)
-        unsure = (variance > SURE_AGAIN * self.variance).any(axis=1) & (self.patience > 0)
-        still = ~informed | (self.still & unsure)
-        patience = np.where(still, self.patience + np.where(informed, -1, PER_GAP), PATIENCE)
-        return Waiting(still, np.where(still[:, None], self.variance, variance), patience)
 
 
 def by_labels(
@@ -224,7 +205,7 @@ def by_labels(
     none, labels, (h, _, f) = np.zeros(0), len(plant.labels), sets.direction.shape
 
     def start(n: int) -> Any:  # the automata, the statistic, and what is waited for
-        return np.zeros((n, 5), np.int64), None, Waiting(np.zeros(n, bool), np.full((n, p), np.inf), np.full(n, PATIENCE))
+        return np.zeros((n, 5), np.int64), None, np.tile([0.0, label_kernels.PATIENCE, *[np.inf] * p], (n, 1))
 
     def costs(r: Reading) -> tuple[Array, Array]:
         assert r.z is not None
@@ -236,10 +217,11 @@ def by_labels(
 
     def step(state: Any, k: Array, r: Reading, informed: Array) -> tuple[Any, Verdict]:
         declared, tested, waiting = state
-        n, rise = len(k), None
+        n, rise, P = len(k), None, None
         if r.P is not None:
-            waiting = waiting.after(informed, np.diagonal(r.P, axis1=1, axis2=2))
-            informed = informed & ~waiting.still
+            P, before, waiting, counts = contiguous(r.P), waiting, np.empty((n, 2 + p)), np.empty(n, bool)
+            label_kernels.wait(P, informed, before, waiting, counts)
+            informed = counts
         if statistic is not None:
             tested = statistic.start(n, r.nu.shape[1] if r.nu is not None else m) if tested is None else tested
             tested, rise = statistic.step(tested, r, informed & (k > after.warmup))
@@ -254,8 +236,8 @@ def by_labels(
             label_kernels.declare(cost, *told)
         else:
             assert r.z is not None
-            assert r.P is not None
-            P = contiguous(r.P) if fixed is None else fixed
+            assert P is not None
+            P = P if fixed is None else fixed
             cost, at = np.empty((n, labels)), np.empty((n, h, f))
             label_kernels.judge(contiguous(r.z), P, excess, *sets, *told, cost, at)
         if on_line and at is not None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import boolean, int64, void
 
-from fdi_gym.kernels import M, compiled, helper
+from fdi_gym.kernels import M, bools, compiled, floats, helper
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, Plant
 
@@ -54,7 +54,7 @@ def _scalar(v):
 @compiled(void(int64[::1], M, boolean[:, ::1], M, M))
 def _turn(parts, y, seen, expected, found):
     """Turn the outputs `parts` (4,), vector and sign, of found (n, n_y) where the negative quaternion is what is meant."""
-    p, q, there = np.empty(4), np.empty(4), np.empty(4, np.bool_)
+    p, q, there = floats(4), floats(4), bools(4)
     for e in range(len(y)):
         for i in range(4):
             q[i], p[i] = y[e, parts[i]], expected[e, parts[i]]

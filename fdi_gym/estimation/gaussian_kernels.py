@@ -17,7 +17,7 @@ from fdi_gym.estimation.gaussian_moments import (
     through,
 )
 from fdi_gym.estimation.gaussian_points import COMMANDS, EXTENDED, KNOWN, OUTPUTS, SENSORS, STATES, TANGENT, pass_points
-from fdi_gym.kernels import M, V, compiled, helper
+from fdi_gym.kernels import M, V, compiled, floats, helper
 from fdi_gym.tangent import row
 from fdi_gym.vectors import width
 
@@ -27,9 +27,8 @@ MODEL = (I1, V, V, M, M3)
 
 
 @helper
-def _check(integers, step, X, t, u, known):
-    n = X.shape[0]
-    if X.shape[1] != step.size:
+def _check(integers, step, n, N, t, u, known):
+    if N != step.size:
         raise ValueError("X needs one entry for each of the model's [x; m; d]")
     if t.size == 0 or n % t.size or u.shape[0] == 0 or n % u.shape[0] or known.shape[0] == 0 or n % known.shape[0]:
         raise ValueError("t, u and d need one row for each episode, or fewer that serve equally many episodes each")
@@ -57,11 +56,12 @@ def predict(rule, integers, reals, step, offset, direction, limit, plant, X, P, 
     (n, N), n_x = X.shape, integers[STATES]
     if n == 0:
         return
-    _check(integers, step, X, t, u, known)
+    _check(integers, step, n, N, t, u, known)
     _check_covariances(n, P, N, Q, N)
-    W, mean, room = width(N), np.empty(n_x), room_of(integers, reals, row(N))
-    F, cross, cov = np.empty((n_x, row(N))), np.empty((n_x, W)), np.empty((n_x, width(n_x)))
-    wide, across = np.zeros((N, W)), np.zeros((N, width(n_x)))
+    W, mean, room = width(N), floats(n_x), room_of(integers, reals, row(N))
+    F, cross, cov = floats((n_x, row(N))), floats((n_x, W)), floats((n_x, width(n_x)))
+    wide, across = floats((N, W)), floats((N, width(n_x)))
+    wide[:], across[:] = 0.0, 0.0
     for e in range(n):
         line, te = e % offset.shape[0], t[e * t.size // n]
         Xe, ue, de = X[e], u[e * u.shape[0] // n], known[e * known.shape[0] // n]
@@ -102,8 +102,8 @@ def differentiate(integers, reals, step, offset, direction, X, t, u, known, X1, 
     (n, N), n_x = X.shape, integers[STATES]
     if n == 0:
         return
-    _check(integers, step, X, t, u, known)
-    mean, moved, room = np.empty(n_x), np.empty((n_x, row(N))), room_of(integers, reals, row(N))
+    _check(integers, step, n, N, t, u, known)
+    mean, moved, room = floats(n_x), floats((n_x, row(N))), room_of(integers, reals, row(N))
     for e in range(n):
         line, te = e % offset.shape[0], t[e * t.size // n]
         ue, de = u[e * u.shape[0] // n], known[e * known.shape[0] // n]
@@ -123,16 +123,20 @@ def update(
     (n, N), m = X.shape, integers[SENSORS]
     if n == 0:
         return
-    _check(integers, step, X, t, u, known)
+    _check(integers, step, n, N, t, u, known)
     _check_covariances(n, P, N, R, m)
     _check_sensors(n, m, y, seen)
-    W, mean, U, white = width(N), np.zeros(m), np.empty((m, m)), np.empty(m)
-    cross, cov, low = np.zeros((m, W)), np.zeros((m, width(m))), np.zeros((N + 1, W))
-    wide, across, F, faults = np.zeros((N, W)), np.zeros((N, width(m))), np.empty((m, W)), own_faults(integers)
-    room, x, values = room_of(integers, reals, W), np.empty(N), np.empty(integers[OUTPUTS])
+    W, mean, U, white = width(N), floats(m), floats((m, m)), floats(m)
+    cross, cov, low = floats((m, W)), floats((m, width(m))), floats((N + 1, W))
+    wide, across, F, faults = floats((N, W)), floats((N, width(m))), floats((m, W)), own_faults(integers)
+    room, x, values = room_of(integers, reals, W), floats(N), floats(integers[OUTPUTS])
+    mean[:], cross[:], cov[:], low[:], wide[:], across[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for e in range(n):
         ye, reported = y[e * y.shape[0] // n], seen[e * y.shape[0] // n]
-        if not reported.any():
+        count[e] = 0
+        for a in range(m):
+            count[e] += reported[a]
+        if count[e] == 0:
             pass  # and nothing of what the episode before has left enters
         elif H.shape[0] > 0 or rule == EXTENDED:
             line, te, Xe = e % offset.shape[0], t[e * t.size // n], X[e]
@@ -154,9 +158,8 @@ def update(
             line, te = e % offset.shape[0], t[e * t.size // n]
             ue, de = u[e * u.shape[0] // n], known[e * known.shape[0] // n]
             through(rule, False, integers, reals, offset[line], direction[line], te, X[e], P[e], ue, de, mean, cross, cov)
-        Re, count[e] = R[e % R.shape[0]], 0
+        Re = R[e % R.shape[0]]
         for a in range(m):
-            count[e] += reported[a]
             for b in range(m):
                 cov[a, b] += Re[a, b]
         distance[e], log[e] = correct_episode(
@@ -173,7 +176,8 @@ def correct(seen, X, P, y, mean, cross, S, X1, P1, nu, S1, K, distance, log):
     if mean.shape[0] != n or cross.shape != (n, N, m) or S.shape != (n, m, m) or P.shape != (n, N, N):
         raise ValueError("the shapes are X (n, N), P (n, N, N), mean (n, m), cross (n, N, m) and S (n, m, m)")
     _check_sensors(n, m, y, seen)
-    W, low, U, white = np.zeros((m, width(N))), np.zeros((N + 1, width(N))), np.empty((m, m)), np.empty(m)
+    W, low, U, white = floats((m, width(N))), floats((N + 1, width(N))), floats((m, m)), floats(m)
+    W[:], low[:] = 0.0, 0.0
     for e in range(n):
         for a in range(m):
             for i in range(N):
@@ -196,7 +200,7 @@ def images(moving, integers, reals, step, offset, direction, X, t, u, known, out
     n, points, N = X.shape
     if n == 0 or points == 0:
         return
-    _check(integers, step, X[:, 0].copy(), t, u, known)
+    _check(integers, step, n, N, t, u, known)
     for e in range(n):
         line = e % offset.shape[0]
         te, ue, de = t[e * t.size // n], u[e * u.shape[0] // n], known[e * known.shape[0] // n]

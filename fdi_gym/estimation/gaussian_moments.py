@@ -37,11 +37,12 @@ from fdi_gym.estimation.gaussian_points import (
     factor,
     moments_of_points,
     pass_points,
+    put,
     put_magnitudes,
     spread,
     squared_step,
 )
-from fdi_gym.kernels import helper, map_at
+from fdi_gym.kernels import floats, helper, inlined, ints, map_at
 from fdi_gym.tangent import tangent_at
 
 
@@ -49,8 +50,8 @@ from fdi_gym.tangent import tangent_at
 def through(rule, moving, integers, reals, offset, direction, t, X, P, u, known, mean, cross, cov):
     """N(X, P) through f (moving) or h at points: mean (m,), cov (m, m) and cross (m, N) with what went in."""
     N, m = X.size, mean.size
-    points, values = np.empty((2 * N + 1, N)), np.empty((2 * N + 1, m))
-    U, first = np.empty((N, N)), np.empty((N, m))
+    points, values = floats((2 * N + 1, N)), floats((2 * N + 1, m))
+    U, first = floats((N, N)), floats((N, m))
     factor(P, U)
     spread(X, U, np.sqrt(squared_step(rule, N)), points)
     pass_points(moving, integers, reals, offset, direction, t, points, u, known, values)
@@ -62,7 +63,7 @@ def through(rule, moving, integers, reals, offset, direction, t, X, P, u, known,
 def differenced(integers, reals, step, offset, direction, t, X, u, known, F, mean):
     """mean = f(X) and F (n_x, W) its Jacobian, by central differences."""
     N, m, moved = X.size, mean.size, 0  # so many columns are not 0
-    points, values = np.empty((2 * N + 1, N)), np.empty((2 * N + 1, m))
+    points, values = floats((2 * N + 1, N)), floats((2 * N + 1, m))
     for j in range(N):
         if enters(True, integers, direction, j):
             for i in range(N):
@@ -70,7 +71,7 @@ def differenced(integers, reals, step, offset, direction, t, X, u, known, F, mea
             points[1 + 2 * moved, j] += step[j]
             points[2 + 2 * moved, j] -= step[j]
             moved += 1
-    points[0] = X
+    put(X, points[0])
     pass_points(True, integers, reals, offset, direction, t, points[: 1 + 2 * moved], u, known, values)
     moved = 0
     for j in range(N):
@@ -142,11 +143,12 @@ def sensed(integers, reals, step, offset, direction, t, X, u, known, room, x, y,
             put_magnitude(integers, offset, direction, x, j - n_x, reals, now)
 
 
-@helper
+@inlined
 def own_faults(integers):
     """Which entries are the gain and the bias of each sensor (2, m); -1 where none is."""
     p, m, own, n_y = integers[ENTRIES], integers[SENSORS], integers[OWN], integers[OUTPUTS]
-    found = np.full((2, m), -1)
+    found = ints((2, m))
+    found[:] = -1
     for a in range(m):
         i = own + integers[SIZES + p + integers[DISTURBANCES] + a]
         for e in range(p):
@@ -258,10 +260,12 @@ def differentiated(integers, reals, step, offset, direction, t, X, u, known, roo
     tangent_at(integers[TANGENT])(t, reals[0], integers[SUBSTEPS], mean, u, theta, d, physical, L, used[:count], step, F)
 
 
-@helper
+@inlined
 def room_of(integers, reals, W):
     """Room for theta and p, in one and apart, d, and deviations of all of them (-1, W) with which of those count."""
     n_theta, own, n_D = integers[THETA], integers[OWN], integers[KNOWN]
-    now = reals[1:].copy()
-    L, used = np.zeros((own + n_D + now.size - n_theta, W)), np.empty(integers[ENTRIES] + integers[DISTURBANCES], np.int64)
-    return now, now[:own], now[n_theta:], np.empty(n_D), L, used
+    now, d, used = floats(reals.size - 1), floats(n_D), ints(integers[ENTRIES] + integers[DISTURBANCES])
+    L = floats((own + n_D + now.size - n_theta, W))
+    put(reals[1:], now)
+    L[:] = 0.0
+    return now, now[:own], now[n_theta:], d, L, used

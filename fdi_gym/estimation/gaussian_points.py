@@ -8,13 +8,20 @@ from __future__ import annotations
 import numpy as np
 
 from fdi_gym.integration import LANES, lanes_at
-from fdi_gym.kernels import helper, map_at
+from fdi_gym.kernels import floats, helper, map_at
 
 EXTENDED, UNSCENTED, CENTRAL_DIFFERENCE = 0, 1, 2
 JITTER, RETRIES = 1e-14, 7  # added to the diagonal where the factorisation fails, times 100 at each retry
 # The integers of a model: three addresses (the last may be 0), sizes, then the lists (entries, disturbances, sensors)
 OF_LANES, OUTPUT, TANGENT, ADDRESSES = range(4)
 SUBSTEPS, STATES, OUTPUTS, THETA, KNOWN, ENTRIES, DISTURBANCES, SENSORS, OWN, COMMANDS, SIZES = range(ADDRESSES, 14)
+
+
+@helper
+def put(values, into):
+    """Put values (n,) into the first entries of a vector."""
+    for i in range(values.size):
+        into[i] = values[i]
 
 
 @helper
@@ -57,7 +64,9 @@ def read_points(integers, reals, offset, direction, t, points, u, known, values)
     n_d, m, own, n_m = integers[DISTURBANCES], integers[SENSORS], integers[OWN], direction.shape[1]
     disturbances, sensors = integers[SIZES + p : SIZES + p + n_d], integers[SIZES + p + n_d :]
     nominal = reals[1:]
-    now, d, x, y = nominal.copy(), known.copy(), np.empty(n_x), np.empty(n_y)
+    now, d, x, y = floats(nominal.size), floats(known.size), floats(n_x), floats(n_y)
+    put(nominal, now)
+    put(known, d)
     theta, theta_p, physical = now[:n_theta], now[:own], now[n_theta:]  # beyond the plant's own are faults of the sensors
     for i in range(points.shape[0]):
         if other_magnitudes(integers, direction, points, i):
@@ -80,10 +89,14 @@ def move_points(integers, reals, offset, direction, t, points, u, known, values)
     lanes = lanes_at(integers[OF_LANES])
     n_x, n_theta, p, n_d = integers[STATES], integers[THETA], integers[ENTRIES], integers[DISTURBANCES]
     n_m, M, nominal = direction.shape[1], points.shape[0], reals[1:]
-    disturbances, now = integers[SIZES + p : SIZES + p + n_d], nominal.copy()
-    T, X, U, D = np.full(LANES, t), np.empty((LANES, n_x)), np.empty((LANES, u.size)), np.empty((LANES, known.size))
-    acts, P = np.empty((LANES, n_theta)), np.empty((LANES, now.size - n_theta))
-    U[:], D[:] = u, known
+    disturbances, now = integers[SIZES + p : SIZES + p + n_d], floats(nominal.size)
+    T, X, U, D = floats(LANES), floats((LANES, n_x)), floats((LANES, u.size)), floats((LANES, known.size))
+    acts, P = floats((LANES, n_theta)), floats((LANES, now.size - n_theta))
+    put(nominal, now)
+    T[:] = t
+    for lane in range(LANES):
+        put(u, U[lane])
+        put(known, D[lane])
     for first in range(0, M, LANES):
         for lane in range(LANES):
             i = min(first + lane, M - 1)

@@ -7,17 +7,19 @@ from numba import boolean, float64, int64, void
 
 from fdi_gym.estimation.automaton import advance
 from fdi_gym.estimation.compiled import box_minimum, eliminate
-from fdi_gym.kernels import M, V, compiled, helper
+from fdi_gym.kernels import M, V, compiled, floats, helper, inlined, ints
 
 I1, I2, B1, M3 = int64[::1], int64[:, ::1], boolean[::1], float64[:, :, ::1]
+SURE_AGAIN = 1.2  # times the variance before a gap
+PATIENCE, PER_GAP = 20.0, 2.0  # it waits for so many samples at most, and so many more for each without a report
 SETS = (I1, M, M3, M, M)  # faults, offset, direction, low, high: of the sets, as in `labels.Manifolds`
 
 
-@helper
+@inlined
 def room(p, most):
     """What `nearest_points` works in, for sets of up to `most` faults in p dimensions."""
-    G, g, ID, Io = np.empty((most, most)), np.empty(most), np.empty((most, p)), np.empty(p)
-    a, at, where, tried = np.empty((most, most + 1)), np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
+    G, g, ID, Io = floats((most, most)), floats(most), floats((most, p)), floats(p)
+    a, at, where, tried = floats((most, most + 1)), ints(most), ints(most), floats(most)
     return G, g, ID, Io, a, at, where, tried
 
 
@@ -85,7 +87,7 @@ def informative(I, z, Iz):  # noqa: E741
 def distances(z, P, excess, faults, offset, direction, low, high, J, m):
     """J (n, 1 + sets): squared distances of z (n, p) to healthy and each set in the metric of P (n or 1, p, p) + excess."""
     n, p = z.shape
-    a, I, Iz, work = np.empty((p, p)), np.empty((p, p)), np.empty(p), room(p, direction.shape[2])  # noqa: E741
+    a, I, Iz, work = floats((p, p)), floats((p, p)), floats(p), room(p, direction.shape[2])  # noqa: E741
     for e in range(n):
         if e < len(P):
             invert(P[e], excess, a, I)
@@ -135,6 +137,26 @@ def declared(cost, penalty, statistic, limit, after, state, state1):
     state1[0], state1[1], state1[2], state1[3], state1[4] = new
 
 
+@compiled(void(M3, B1, M, M, B1))
+def wait(P, informed, state, state1, counts):
+    """Whether samples count (n,): none after a gap does until the estimate is about as sure again, or does not become so.
+
+    `informed` (n,): some sensor reported. The state (n, 2 + p): whether it is waited, for how many samples with reports at
+    most, and the variances of the estimate when a sample last counted; P (n, p, p) has those of now.
+    """
+    p = P.shape[1]
+    for e in range(len(counts)):
+        still, patience = state[e, 0] > 0.0, state[e, 1]
+        unsure = False
+        for i in range(p):
+            unsure = unsure or P[e, i, i] > SURE_AGAIN * state[e, 2 + i]
+        still = not informed[e] or (still and unsure and patience > 0.0)
+        counts[e], state1[e, 0] = not still, still
+        state1[e, 1] = patience + (-1.0 if informed[e] else PER_GAP) if still else PATIENCE
+        for i in range(p):
+            state1[e, 2 + i] = state[e, 2 + i] if still else P[e, i, i]
+
+
 @compiled(void(M, V, V, float64, I1, I1, B1, I2, I2, I1, B1))
 def declare(cost, penalty, statistic, limit, after, k, informed, state, state1, label, alarm):
     """The automata (n, 5) one sample later, and what they declare, from the costs (n, labels) and what each label must gain.
@@ -158,8 +180,8 @@ def judge(
 ):  # fmt: skip
     """`distances` as the costs of `declare`: of health, and of set s at labels[s]."""
     n, p = z.shape
-    a, I, Iz, work = np.empty((p, p)), np.empty((p, p)), np.empty(p), room(p, direction.shape[2])  # noqa: E741
-    J = np.empty(len(faults))
+    a, I, Iz, work = floats((p, p)), floats((p, p)), floats(p), room(p, direction.shape[2])  # noqa: E741
+    J = floats(len(faults))
     for e in range(n):
         if e < len(P):
             invert(P[e], excess, a, I)

@@ -35,7 +35,7 @@ def mixture(w: Array, X: Array, P: Array) -> tuple[Array, Array]:
     return mean, mixed
 
 
-@compiled(void(M3, M3, M4, M3, M4))
+@compiled(void(M3, M3, M4, M3, M4), heap=True)  # a bank has many models
 def _mixture(w, X, P, mean, mixed):
     (n, L, N), to = X.shape, w.shape[1]
     W = width(N)
