@@ -11,6 +11,7 @@ from fdi_gym.discovery import load_plant
 from fdi_gym.estimation import automaton, gaussian
 from fdi_gym.estimation.gaussian import RULES
 from fdi_gym.kernels import kernel
+from fdi_gym.model import NotApplicableError
 
 
 @kernel
@@ -512,6 +513,25 @@ def test_shapes_that_do_not_fit_are_refused(changes, says, act):
     assert case.X.shape == (6, 6)
     with pytest.raises(ValueError, match=says):
         case.predict("extended", **changes) if act == "predict" else case.update("extended", case.seen(), **changes)
+
+
+def test_an_estimate_of_more_than_the_stack_holds_is_refused(motor):
+    for n_m, fits in ((198, True), (199, False)):
+        lines = np.zeros((1, 1)), np.full((1, 1, n_m), 1e-4)
+        scale = np.ones(2 + n_m)
+        if not fits:
+            with pytest.raises(NotApplicableError, match="at most 200 numbers at once, not 201"):
+                gaussian.bind(motor, scale=scale, entries=[0], lines=lines)
+            continue
+        model, X, P = (
+            gaussian.bind(motor, scale=scale, entries=[0], lines=lines),
+            np.zeros((1, 200)),
+            np.eye(200)[None] * 1e-8,
+        )
+        for rule in gaussian.RULES:
+            X1, P1 = gaussian.predict(model, rule, X, P, np.zeros(1), motor.trim_command[None], None, P)
+            assert np.isfinite(X1).all()
+            assert np.isfinite(P1).all()
 
 
 def test_other_bad_input_is_refused():

@@ -9,8 +9,9 @@ import numpy as np
 
 from fdi_gym.estimation.gaussian_points import ADDRESSES
 from fdi_gym.model import contiguous
-from fdi_gym.plant import Array, Plant
+from fdi_gym.plant import Array, NotApplicableError, Plant
 
+LARGEST = 200  # entries of an augmented state: matrices of its points lie on the stack
 STEP = 1e-3  # of the central differences along the axes, in units of the entries' scales
 
 
@@ -60,6 +61,7 @@ def bind(
 
     Raises:
         ValueError: A position does not exist, or an array has the wrong shape or values that are no numbers.
+        NotApplicableError: It would have more than LARGEST entries.
     """
     n_x, n_theta, n_D = len(plant.states), len(plant.theta), len(plant.disturbances)
     where = {
@@ -74,6 +76,8 @@ def bind(
             f"lines are offsets (lines, {p}) and directions (lines, {p}, n_m); not {offset.shape}, {direction.shape}"
         )
     N = n_x + direction.shape[2] + n_d
+    if N > LARGEST:
+        raise NotApplicableError(f"estimates at most {LARGEST} numbers at once, not {N}")
     size, widest = np.array(scale, float), np.full(N, np.inf) if limit is None else np.array(limit, float)
     observed = np.zeros((0, N)) if H is None else np.array(H, float)
     if size.shape != (N,) or not (np.isfinite(size) & (size > 0)).all():
