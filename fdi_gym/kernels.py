@@ -236,7 +236,12 @@ def _arrived(module: str, name: str) -> Any:
 
 
 # ---------------------------------------------------------------------------------------------------------------
-# Plant functions as numbers
+# Kernels as numbers
+
+
+def signature_of(dispatcher: Any) -> Any:
+    """What a kernel takes."""
+    return _signatures[dispatcher]
 
 
 def address(dispatcher: Any) -> int:

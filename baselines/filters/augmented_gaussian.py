@@ -21,6 +21,7 @@ from fdi_gym.estimation.calibration import Calibration
 from fdi_gym.estimation.decision import Reading, by_labels
 from fdi_gym.estimation.gaussian import RULES
 from fdi_gym.estimation.interval import Interval
+from fdi_gym.estimation.sweep import sweep_of
 from fdi_gym.plant import Array, Plant
 
 
@@ -112,4 +113,4 @@ def augmented_ekf(
     """
     model = augmented(plant, belief, walk=walk, x0_std=x0_std, z0_std=z0_std, z_walk=z_walk)
     rules = by_labels(plant, calibration, decision, size=belief.z_size)
-    return diagnoser_of(plant, gaussian_filter(model, rule, first_sample), rules)
+    return diagnoser_of(plant, gaussian_filter(model, rule, first_sample), rules, sweep_of(model, rule, rules.labelling))

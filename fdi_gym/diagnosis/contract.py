@@ -48,6 +48,8 @@ class Diagnoser(NamedTuple):
     filter: Any = None  # the `filtering.Filter` that it is made of, where it is
     rule: Any = None  # and the `estimation.decision.Rule`
     guarded: bool = False  # whether it is under the guard already
+    # update over several samples (n, K, n_obs) at once: what it says has them along the second axis; None: one by one, please
+    sweep: Callable[[Any, Array], tuple[Any, Diagnosis] | None] | None = None
 
 
 def widened(diagnoser: Diagnoser, plant: Plant, shown: Plant) -> Diagnoser:
@@ -93,15 +95,15 @@ class Recording:
         self._wide: dict[str, Array | None] = dict.fromkeys(("estimate", "estimate_std", "label_probs", "state"))
         self._own: dict[str, Array] = {}
 
-    def keep(self, k: int, said: Diagnosis) -> None:
-        """Put down what was said of sample k."""
+    def keep(self, k: int | slice, said: Diagnosis) -> None:
+        """Put down what was said of sample k, or of several."""
         self._alarm[:, k], self._label[:, k] = said.alarm, said.label
         for name in self._wide:
             value = getattr(said, name)
             if value is not None:
                 store = self._wide[name]
                 if store is None:
-                    store = self._wide[name] = np.full((*self._shape, value.shape[1]), np.nan)
+                    store = self._wide[name] = np.full((*self._shape, value.shape[-1]), np.nan)
                 store[:, k] = value
         for name, value in (said.signals or {}).items() if self._signals else ():
             if name not in self._own:
@@ -122,10 +124,13 @@ def run(diagnoser: Diagnoser, obs: Array, signals: bool = False) -> Decisions:
         signals: Record the method's own signals too.
     """
     n, samples, _ = obs.shape
-    state, recording = diagnoser.init(n), Recording(n, samples, signals)
-    for k in range(samples):
-        state, said = diagnoser.update(state, obs[:, k])
-        recording.keep(k, said)
+    state, recording, k = diagnoser.init(n), Recording(n, samples, signals), 0
+    while k < samples:
+        several = diagnoser.sweep(state, obs[:, k:]) if diagnoser.sweep is not None and k == 1 and not signals else None
+        done = slice(k, k + 1) if several is None else slice(k, samples)
+        state, said = diagnoser.update(state, obs[:, k]) if several is None else several
+        recording.keep(k if several is None else done, said)
+        k = done.stop
     return recording.decisions()
 
 

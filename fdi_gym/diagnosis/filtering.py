@@ -21,6 +21,7 @@ from fdi_gym.estimation.decision import Reading, Rule, Verdict
 from fdi_gym.estimation.equivalent import has_equivalents, nearest
 from fdi_gym.estimation.interval import Interval, held_command_covariance
 from fdi_gym.estimation.sensor_checks import Checks, SensorChecks
+from fdi_gym.estimation.sweep import Sweep
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, Plant
 
@@ -153,13 +154,19 @@ def checked(plant: Plant, filter: Filter) -> Filter:
     )
 
 
-def diagnoser_of(plant: Plant, filter: Filter, rule: Rule) -> Diagnoser:
+def diagnoser_of(plant: Plant, filter: Filter, rule: Rule, sweep: Sweep | None = None) -> Diagnoser:
     """The diagnoser that declares what a rule makes of a filter's readings.
 
     Where the plant's sensors may fail, the rule hears `fdi_gym.estimation.sensor_checks` too.
+
+    Args:
+        plant: The plant.
+        filter: The filter.
+        rule: The decision.
+        sweep: Both over many samples at once, to the same numbers: of `fdi_gym.estimation.sweep`.
     """
     if plant.bare is not None:
-        filter = checked(plant, filter)
+        filter, sweep = checked(plant, filter), None
     start, step = shell(plant, filter, rule)
     healthy = contiguous(plant.healthy)
 
@@ -176,7 +183,32 @@ def diagnoser_of(plant: Plant, filter: Filter, rule: Rule) -> Diagnoser:
         signals = {**(r.signals or {}), **(verdict.signals or {})} if r.signals or verdict.signals else None
         return s, Diagnosis(verdict.alarm, verdict.label, estimate, std, r.probs, r.x, signals)
 
-    return Diagnoser(start, update, gaps=True, filter=filter, rule=rule)
+    along = None if sweep is None else swept(plant, sweep)
+    return Diagnoser(start, update, gaps=True, filter=filter, rule=rule, sweep=along)
+
+
+def swept(plant: Plant, sweep: Sweep) -> Callable[[Running, Array], tuple[Running, Diagnosis] | None]:
+    """Many samples at once: where all episodes run and all commands and known signals reported."""
+    n_y, n_u = len(plant.outputs), len(plant.commands)
+
+    def along(s: Running, obs: Array) -> tuple[Running, Diagnosis] | None:
+        if not (s.begun & (s.k > 0)).all() or not np.isfinite(obs[:, :, n_y:]).all():
+            return None
+        n, K, _ = obs.shape
+        u, known, d = obs[:, -1, n_y : n_y + n_u].copy(), obs[:, :, n_y + n_u :], None
+        if plant.measured_disturbance is not None:
+            before = np.concatenate([s.known[:, None], known[:, :-1]], axis=1)
+            t = (s.k[:, None] + np.arange(K) - 1) * plant.dt
+            flat = (a.reshape(n * K, *a.shape[2:]) for a in (t, before, known))
+            d = plant.measured_disturbance(*flat).reshape(n, K, -1)
+        declared, tested, waiting = s.rule
+        done = sweep(obs, d, s.k, *s.filter, declared, waiting)
+        after = type(s.filter)(done.X, done.P, done.nu, done.S, done.count)
+        said = Diagnosis(done.alarm, done.label, done.estimate, done.std, None, done.state)
+        rule = (done.declared, tested, done.waiting)
+        return Running(s.k + K, s.begun, u, np.zeros(u.shape), known[:, -1].copy(), after, rule), said
+
+    return along
 
 
 def readings(plant: Plant, diagnoser: Diagnoser, obs: Array) -> Iterator[tuple[Reading, Verdict]]:

@@ -154,4 +154,21 @@ def guarded(raw: Diagnoser, plant: Plant) -> Diagnoser:
             answer = answer._replace(alarm=answer.alarm & ~lost, label=np.where(lost, -1, answer.label), **numbers)
         return (after, answer, obs, lost), answer
 
-    return Diagnoser(init, update, raw.gaps, raw.filter, raw.rule, guarded=True)
+    def sweep(state: Any, obs: Array) -> tuple[Any, Diagnosis] | None:
+        """As long as nobody is lost."""
+        inner, _, _, lost = state
+        (n, samples, _), found = obs.shape, None
+        if raw.sweep is not None and n and samples and obs.shape[2] == width and not lost.any():
+            with np.errstate(all="ignore"):
+                found = raw.sweep(inner, obs)
+        if found is None:
+            return None
+        after, said = found
+        flat = map_arrays(lambda a: a.reshape(n * samples, *a.shape[2:]), said)
+        flat, _, bad = examined(n * samples, flat)
+        if bad:
+            return None
+        said = map_arrays(lambda a: a.reshape(n, samples, *a.shape[1:]), flat)
+        return (after, map_arrays(lambda a: a[:, -1].copy(), said), contiguous(obs[:, -1]), lost), said
+
+    return Diagnoser(init, update, raw.gaps, raw.filter, raw.rule, True, None if raw.sweep is None else sweep)

@@ -29,7 +29,7 @@ from fdi_gym.estimation import label_kernels
 from fdi_gym.estimation.automaton import Automaton, first, step
 from fdi_gym.estimation.calibration import LEAST, Calibration, Persistence
 from fdi_gym.estimation.kalman import quadratic
-from fdi_gym.estimation.labels import distances, manifolds
+from fdi_gym.estimation.labels import Manifolds, distances, manifolds
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, Plant
 
@@ -70,11 +70,23 @@ class Verdict(NamedTuple):
     signals: dict[str, Array] | None = None  # (n, ...) each, beside the reading's
 
 
+class Labelling(NamedTuple):
+    """What `by_labels` weighs with."""
+
+    excess: Array  # (p, p) what the estimate's covariance lacks
+    metric: Array | None  # (1, p, p) that takes its place
+    sets: Manifolds
+    penalty: Array  # (labels,) what each must gain
+    limit: float  # of the statistic that raises the alarm in place of the costs
+    lengths: Array  # (5,) rise, switch, release, same, warmup
+
+
 class Rule(NamedTuple):
     """A pair of functions; see the module's docstring."""
 
     start: Callable[[int], Any]
     step: Callable[[Any, Array, Reading, Array], tuple[Any, Verdict]]  # (state, k (n,), reading, informed (n,) bool)
+    labelling: Labelling | None = None  # of `by_labels`, where it weighs nothing else
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -244,7 +256,8 @@ def by_labels(
             z = (sets.points(at) * (sets.labels == label[:, None])[..., None]).sum(axis=1)
         return (following, tested, waiting), Verdict(alarm, label, z, Evidence(cost, rise))
 
-    return Rule(start, step)
+    plain = statistic is None and not on_line
+    return Rule(start, step, Labelling(excess, fixed, sets, penalty, limit, lengths) if plain else None)
 
 
 def by_candidate(candidate: Callable[[Reading, Array], Array], after: int, warmup: int = 0) -> Rule:

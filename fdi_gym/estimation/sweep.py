@@ -1,0 +1,84 @@
+"""An augmented filter with labels as its decision, over many samples in one compiled call.
+
+What is said is to the bit what `fdi_gym.diagnosis.filtering` says sample by sample; only the way through Python is spared,
+which costs a filter of a few states more than its equations do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from fdi_gym.estimation import sweep_kernels
+from fdi_gym.estimation.augmented import AugmentedModel
+from fdi_gym.estimation.decision import Labelling
+from fdi_gym.estimation.equivalent import has_equivalents
+from fdi_gym.estimation.gaussian import RULES
+from fdi_gym.model import contiguous
+from fdi_gym.plant import Array
+
+
+class Swept(NamedTuple):
+    """State of a filter and its decision after the last sample, and what was said of each."""
+
+    X: Array  # (n, N)
+    P: Array  # (n, N, N)
+    nu: Array  # (n, m) last innovation
+    S: Array  # (n, m, m) its covariance
+    count: Array  # (n,) sensors in it
+    declared: Array  # (n, 5) the automata
+    waiting: Array  # (n, 2 + p)
+    alarm: Array  # (n, K) bool
+    label: Array  # (n, K) int16
+    estimate: Array  # (n, K, p)
+    std: Array  # (n, K, p)
+    state: Array  # (n, K, n_x)
+
+
+Sweep = Callable[..., Swept]
+
+
+def sweep_of(model: AugmentedModel, rule: str, decision: Labelling | None) -> Sweep | None:
+    """The sweep of an augmented filter whose decision is `by_labels`; None where it must go sample by sample.
+
+    That is where a statistic raises the alarm, or where measurements have equivalents to choose from.
+
+    Args:
+        model: The model, of one line.
+        rule: One of `gaussian.RULES`.
+        decision: What the decision weighs with.
+    """
+    plant = model.plant
+    if decision is None or has_equivalents(plant) or model.lines is not None:
+        return None
+    bound, (Q, R), healthy = model.compiled, model.noises, contiguous(plant.healthy)
+    head = (RULES[rule], *bound.constants, bound.limit, bound.linear, bound.H, bound.plain, contiguous(Q), contiguous(R))
+    metric = np.zeros((0, *decision.excess.shape)) if decision.metric is None else decision.metric
+    steps = np.array(sweep_kernels.addresses(), np.int64)
+    weighed = (
+        decision.excess, metric, decision.sets.labels, *decision.sets[1:], decision.penalty, decision.limit,
+        decision.lengths, healthy,
+    )  # fmt: skip
+
+    def sweep(
+        obs: Array, d: Array | None, k: Array, X: Array, P: Array, nu: Array, S: Array, count: Array, declared: Array,
+        waiting: Array,
+    ) -> Swept:  # fmt: skip
+        """Over obs (n, K, n_obs) with the measured disturbances d (n, K, n_D), from sample k (n,) on; the state as `Swept`."""
+        n, K, _ = obs.shape
+        known = np.zeros((n, K, len(plant.disturbances))) if d is None else contiguous(d)
+        room = np.empty((2, *P.shape))
+        room[0] = P
+        after = [np.array(a, order="C") for a in (X, nu, S, count, declared, waiting)]
+        X, nu, S, count, declared, waiting = after
+        alarm, label, state = np.empty((n, K), bool), np.empty((n, K), np.int16), np.empty((n, K, len(plant.states)))
+        estimate, std = np.empty((2, n, K, len(healthy)))
+        sweep_kernels.sweep(
+            steps, *head, *weighed, contiguous(obs), known, k, X, room, nu, S, count, declared, waiting,
+            alarm, label, estimate, std, state,
+        )  # fmt: skip
+        return Swept(X, room[0], nu, S, count, declared, waiting, alarm, label, estimate, std, state)
+
+    return sweep
