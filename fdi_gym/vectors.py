@@ -7,12 +7,14 @@ scalar would be: no sum is over lanes, nothing is contracted, and the numbers ar
 from __future__ import annotations
 
 import functools
+import operator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from llvmlite import ir
-from numba import float64, intp
+from numba import boolean, float64, intp
 from numba.core import cgutils, types
-from numba.extending import intrinsic, models, register_model
+from numba.extending import intrinsic, models, overload, register_model
 
 from fdi_gym.integration import LANES
 from fdi_gym.kernels import helper
@@ -101,3 +103,104 @@ def vectors(count: int) -> Vectors:
 
 
 zeros, load, store, plus, minus, over = vectors(LANES)
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# A vector in place of a number: + - * / of vectors, and of vectors and numbers
+
+
+def _spread(builder: Any, kind: Any, value: Any, count: int) -> Any:
+    """A number in all lanes; a vector as it is."""
+    if isinstance(kind, Lanes):
+        return value
+    one = builder.insert_element(
+        ir.Constant(ir.VectorType(ir.DoubleType(), count), ir.Undefined), value, ir.Constant(ir.IntType(32), 0)
+    )
+    return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(ir.IntType(32), count), None))
+
+
+def _lanes_of(*kinds: Any) -> Any:
+    """The type of the vector among these, where they are vectors and real numbers."""
+    found = [kind for kind in kinds if isinstance(kind, Lanes)]
+    return found[0] if found and all(isinstance(kind, (Lanes, types.Float)) for kind in kinds) else None
+
+
+def _operation(build: Callable[..., Any]) -> Any:
+    """An intrinsic of two or more vectors or numbers; build(builder, *vectors) makes its value."""
+
+    def made(typing_context, given):
+        lanes = _lanes_of(*given)
+        if lanes is None:
+            return None
+
+        def codegen(context, builder, signature, values):
+            parts = cgutils.unpack_tuple(builder, values[0])
+            return build(
+                builder,
+                *(_spread(builder, kind, part, lanes.count) for kind, part in zip(given, parts, strict=True)),
+            )
+
+        return lanes(given), codegen
+
+    return intrinsic(made)
+
+
+_ADD = _operation(lambda builder, v, w: builder.fadd(v, w))
+_SUBTRACT = _operation(lambda builder, v, w: builder.fsub(v, w))
+_MULTIPLY = _operation(lambda builder, v, w: builder.fmul(v, w))
+_DIVIDE = _operation(lambda builder, v, w: builder.fdiv(v, w))
+_CHOOSE = _operation(
+    lambda builder, c, v, w: builder.select(builder.fcmp_ordered(">", c, ir.Constant(c.type, None)), v, w)
+)
+
+
+def _overloaded(symbol: Any, operation: Any) -> None:
+    @overload(symbol)
+    def of_vectors(v, w):
+        if _lanes_of(v, w) is not None:
+            return lambda v, w: operation((v, w))
+        return None
+
+
+for _symbol, _made in (
+    (operator.add, _ADD), (operator.sub, _SUBTRACT), (operator.mul, _MULTIPLY), (operator.truediv, _DIVIDE),
+):  # fmt: skip
+    _overloaded(_symbol, _made)
+    _overloaded(getattr(operator, f"i{_symbol.__name__}"), _made)
+
+
+@helper
+def choose(c, v, w):
+    """v where c > 0, else w, also where c is no number; each a vector or a number, one of them a vector."""
+    return _CHOOSE((c, v, w))
+
+
+@intrinsic
+def root(typing_context, v):
+    """The square roots."""
+
+    def codegen(context, builder, signature, given):
+        (vector,) = given
+        name = f"llvm.sqrt.v{v.count}f64"
+        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(vector.type, [vector.type]), name)
+        return builder.call(function, [vector])
+
+    return (v(v), codegen) if isinstance(v, Lanes) else None
+
+
+def _any_lane(comparison: str, ordered: bool) -> Any:
+    def made(typing_context, v):
+        def codegen(context, builder, signature, given):
+            (vector,) = given
+            compare = builder.fcmp_ordered if ordered else builder.fcmp_unordered
+            which = compare(comparison, vector, ir.Constant(vector.type, None))
+            bits = builder.bitcast(which, ir.IntType(v.count))
+            return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
+
+        return (boolean(v), codegen) if isinstance(v, Lanes) else None
+
+    return intrinsic(made)
+
+
+above = _any_lane(">", ordered=True)  # above(v): any lane is above 0
+filled = _any_lane("!=", ordered=False)  # filled(v): any lane is not 0

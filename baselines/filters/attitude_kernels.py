@@ -3,7 +3,8 @@
 import numpy as np
 from numba import float64, int64, void
 
-from fdi_gym.estimation.gaussian_points import UNSCENTED, factor, moments_of_points, spread, squared_step
+from fdi_gym.estimation.gaussian_algebra import board_matrices, disembark, factor
+from fdi_gym.estimation.gaussian_points import UNSCENTED, moments_of_points, spread, squared_step
 from fdi_gym.integration import LANES, lanes_at
 from fdi_gym.kernels import M, V, compiled, floats, helper
 
@@ -29,6 +30,7 @@ def predict(lanes_address, dt, substeps, physical, X, P, sign, u, Q, X1, P1, sig
     n_x, count = N - n_theta + 1, 2 * N + 1
     T, x, us, theta = floats(LANES), floats((LANES, n_x)), floats((LANES, n_theta)), floats((LANES, n_theta))
     d, p = floats((LANES, 0)), floats((LANES, physical.size))
+    Ps, Us = floats((N * N, LANES)), floats((N * N, LANES))
     U, points, values, first = floats((N, N)), floats((count, N)), floats((count, N)), floats((N, N))
     mean, cross, cov = floats(N), floats((N, N)), floats((N, N))
     T[:] = 0.0
@@ -36,7 +38,10 @@ def predict(lanes_address, dt, substeps, physical, X, P, sign, u, Q, X1, P1, sig
         for j in range(physical.size):
             p[lane, j] = physical[j]
     for e in range(n):
-        factor(P[e], U)
+        if e % LANES == 0:
+            board_matrices(P, e, Ps)
+            factor(Ps, N, Us)
+        disembark(Us, N, e % LANES, U)
         spread(X[e], U, np.sqrt(squared_step(UNSCENTED, N)), points)
         for lane in range(LANES):
             for j in range(n_theta):

@@ -1,96 +1,172 @@
-"""The linear algebra of one episode in the compiled Gaussian step: covariances through a matrix, and the correction.
+"""The linear algebra of the compiled Gaussian step, for LANES episodes side by side.
 
-Rows of matrices are whole vectors (`fdi_gym.vectors`), W numbers where N count: what is beyond N is for nobody.
+Entry (i, j) of a matrix with N columns is a vector, row i N + j of an array (entries, LANES): lane by lane the numbers are
+those of one episode alone, in an order that no batch changes. Where fewer episodes are left, the last one fills up.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from fdi_gym.estimation.gaussian_points import factor
 from fdi_gym.integration import LANES
 from fdi_gym.kernels import helper
-from fdi_gym.vectors import load, minus, over, plus, store, zeros
+from fdi_gym.vectors import above, choose, filled, load, root, store, zeros
 
 LOG_2PI = float(np.log(2 * np.pi))
+JITTER, RETRIES = 1e-14, 7  # added to the diagonal where the factorisation fails, times 100 at each retry
 
 
 @helper
-def widen(P, wide):
-    """The rows of P (N, N) in whole vectors (N, W)."""
-    for i in range(P.shape[0]):
-        for j in range(P.shape[1]):
-            wide[i, j] = P[i, j]
+def board_vectors(given, first, shared, into):
+    """Vectors (rows, m) of the episodes from `first` on, of which `shared` in a row have the same: into (m, LANES)."""
+    for lane in range(LANES):
+        e = min(first + lane, given.shape[0] * shared - 1) // shared
+        for i in range(given.shape[1]):
+            into[i, lane] = given[e, i]
 
 
 @helper
-def through_matrix(F, wide, across, cross, cov):
-    """cross = F P (m, W) and cov = F P F' (m, W of m) for F (m, N or more), most of which may be 0.
-
-    wide (N, W) has the rows of P and across (N, W of m) is room for F'.
-    """
-    m, N = cov.shape[0], wide.shape[0]
-    for a in range(m):
-        for j in range(N):
-            across[j, a] = F[a, j]
-        for c in range(0, wide.shape[1], LANES):
-            total = zeros()
-            for j in range(N):
-                if F[a, j] != 0.0:
-                    total = plus(total, F[a, j], load(wide, j, c))
-            store(cross, a, c, total)
-    for a in range(m):
-        for c in range(0, a + 1, LANES):
-            total = zeros()
-            for j in range(N):
-                total = plus(total, cross[a, j], load(across, j, c))
-            store(cov, a, c, total)
-        for b in range(a):
-            cov[b, a] = cov[a, b]
+def board_matrices(given, first, into):
+    """Matrices (n, r, c) of the episodes from `first` on: into (r c, LANES)."""
+    for lane in range(LANES):
+        e = min(first + lane, given.shape[0] - 1)
+        for i in range(given.shape[1]):
+            for j in range(given.shape[2]):
+                into[i * given.shape[2] + j, lane] = given[e, i, j]
 
 
 @helper
-def correct_episode(X, P, y, seen, mean, S, cross, low, U, white, X1, P1, nu, S1):
-    """The Kalman correction of one episode by the sensors that reported: nu' S^-1 nu, and the log density of what they read.
+def board_one(given, lane, columns, into):
+    """The first columns of a matrix (r, ...) of one episode, into its lane of (r columns, LANES)."""
+    for i in range(given.shape[0]):
+        for j in range(columns):
+            into[i * columns + j, lane] = given[i, j]
 
-    A sensor that did not report has nu = 0, no covariance with anything and S = 1. S1 = U' U; `white` becomes U'^-1 nu
-    and cross (m, W) U'^-1 cross; low (N + 1, W) is room.
-    """
-    m, N = mean.size, X.size
+
+@helper
+def disembark(A, n, lane, into):
+    """The matrix (n n) of a lane into (n, n)."""
+    for i in range(n):
+        for j in range(n):
+            into[i, j] = A[i * n + j, lane]
+
+
+@helper
+def put_ashore(e, lane, P, seen, distances, U, X, nu, S, X1, P1, nu1, S1, distance, log):
+    """Episode e of what `correct` has left in a lane, with the log density of what its sensors read; how many reported."""
+    N, m, count, density = X.shape[0], nu.shape[0], 0, 0.0
+    for i in range(N):
+        X1[e, i] = X[i, lane]
+        for j in range(i + 1):
+            P1[e, i, j] = P1[e, j, i] = P[i * N + j, lane]
     for a in range(m):
-        nu[a] = y[a] - mean[a] if seen[a] else 0.0
+        nu1[e, a] = nu[a, lane]
         for b in range(a + 1):
-            S1[a, b] = S1[b, a] = 0.5 * (S[a, b] + S[b, a]) if seen[a] and seen[b] else 0.0
-        if not seen[a]:
-            S1[a, a] = 1.0
-    factor(S1, U)
-    for i in range(N):
-        low[N, i] = X[i]
-        for j in range(i + 1):
-            low[i, j] = 0.5 * (P[i, j] + P[j, i])
-    distance, log = 0.0, 0.0
+            S1[e, a, b] = S1[e, b, a] = S[a * m + b, lane]
+        if seen[a, lane] > 0.0:
+            count += 1
+            density -= 0.5 * LOG_2PI + np.log(U[a * m + a, lane])
+    distance[e] = distances[0, lane]
+    log[e] = density - 0.5 * distance[e]
+    return count
+
+
+@helper
+def factor(P, n, U):
+    """P = U' U with the lower triangle of P (n n); jitter only where it fails without, NaN where no jitter helps."""
+    jitter, bad = zeros(), zeros()
+    for attempt in range(RETRIES + 1):
+        bad = zeros()
+        for i in range(n):
+            for j in range(i, n):
+                store(U, i * n + j, 0, load(P, j * n + i, 0))
+            store(U, i * n + i, 0, load(U, i * n + i, 0) + jitter)
+        for k in range(n):
+            pivot = load(U, k * n + k, 0)
+            bad = choose(pivot, bad, 1.0)  # also where it is no number
+            pivot = root(pivot)
+            store(U, k * n + k, 0, pivot)
+            for j in range(k + 1, n):
+                store(U, k * n + j, 0, load(U, k * n + j, 0) / pivot)
+            for i in range(k + 1, n):
+                over = load(U, k * n + i, 0)
+                for j in range(i, n):
+                    store(U, i * n + j, 0, load(U, i * n + j, 0) - over * load(U, k * n + j, 0))
+        if not above(bad):
+            return
+        jitter = choose(bad, JITTER * 100.0**attempt, jitter)
+    for i in range(n):
+        for j in range(i, n):
+            store(U, i * n + j, 0, choose(bad, np.nan, load(U, i * n + j, 0)))
+
+
+@helper
+def entries_of(F, m, N, where, many):
+    """Which columns of each row of F (m N) are not 0 in any lane: the first many[a] of where (m, N)."""
     for a in range(m):
-        white[a] = nu[a]
-        if seen[a]:
-            for b in range(a):
-                white[a] -= U[b, a] * white[b]
-            white[a] /= U[a, a]
-            distance += white[a] * white[a]
-            log -= 0.5 * LOG_2PI + np.log(U[a, a])
-        for c in range(0, cross.shape[1], LANES):
-            total = load(cross, a, c) if seen[a] else zeros()
-            for b in range(a):
-                total = minus(total, U[b, a], load(cross, b, c))
-            total = over(total, U[a, a])
-            store(cross, a, c, total)
-            store(low, N, c, plus(load(low, N, c), white[a], total))
+        many[a] = 0
+        for j in range(N):
+            if filled(load(F, a * N + j, 0)):
+                where[a, many[a]] = j
+                many[a] += 1
+
+
+@helper
+def through_matrix(F, P, m, N, where, many, cross, cov):
+    """cross = F P (m N) and the lower triangle of cov = F P F' (m m) for F (m N), most of which may be 0 (`entries_of`)."""
+    for a in range(m):
+        for c in range(N):
+            total = zeros()
+            for s in range(many[a]):
+                j = where[a, s]
+                total += load(F, a * N + j, 0) * load(P, j * N + c, 0)
+            store(cross, a * N + c, 0, total)
+    for a in range(m):
+        for b in range(a + 1):
+            total = zeros()
+            for s in range(many[b]):
+                j = where[b, s]
+                total += load(cross, a * N + j, 0) * load(F, b * N + j, 0)
+            store(cov, a * m + b, 0, total)
+
+
+@helper
+def correct(X, P, y, seen, mean, S, cross, m, N, U, white, X1, nu, S1):
+    """The Kalman correction by the sensors that reported (seen > 0): nu' S^-1 nu.
+
+    A sensor that did not report has nu = 0, no covariance with anything and S = 1. X1 is the new mean, and of P (N N) the
+    lower triangle the new covariance's; S1 has a lower triangle, S1 = U' U, white becomes U'^-1 nu and cross (m N)
+    U'^-1 cross.
+    """
+    for a in range(m):
+        there = load(seen, a, 0)
+        store(nu, a, 0, choose(there, load(y, a, 0) - load(mean, a, 0), 0.0))
+        for b in range(a + 1):
+            both = choose(there, load(seen, b, 0), 0.0)
+            store(S1, a * m + b, 0, choose(both, 0.5 * (load(S, a * m + b, 0) + load(S, b * m + a, 0)), 0.0))
+        store(S1, a * m + a, 0, choose(there, load(S1, a * m + a, 0), 1.0))
+    factor(S1, m, U)
+    distance = zeros()
     for i in range(N):
-        X1[i] = low[N, i]
-        for c in range(0, i + 1, LANES):
-            total = load(low, i, c)
-            for a in range(m):
-                total = minus(total, cross[a, i], load(cross, a, c))
-            store(low, i, c, total)
+        store(X1, i, 0, load(X, i, 0))
+    for a in range(m):
+        there, pivot, total = load(seen, a, 0), load(U, a * m + a, 0), load(nu, a, 0)
+        for b in range(a):
+            total -= load(U, b * m + a, 0) * load(white, b, 0)
+        total = choose(there, total / pivot, 0.0)
+        store(white, a, 0, total)
+        distance += total * total
+        for i in range(N):
+            found = load(cross, a * N + i, 0)
+            for b in range(a):
+                found -= load(U, b * m + a, 0) * load(cross, b * N + i, 0)
+            found = choose(there, found / pivot, 0.0)
+            store(cross, a * N + i, 0, found)
+            store(X1, i, 0, load(X1, i, 0) + total * found)
+    for i in range(N):
         for j in range(i + 1):
-            P1[i, j] = P1[j, i] = low[i, j]
-    return distance, log - 0.5 * distance
+            left = 0.5 * (load(P, i * N + j, 0) + load(P, j * N + i, 0))
+            for a in range(m):
+                left -= load(cross, a * N + i, 0) * load(cross, a * N + j, 0)
+            store(P, i * N + j, 0, left)
+    return distance

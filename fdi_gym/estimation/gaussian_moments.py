@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fdi_gym.estimation.gaussian_algebra import board_one
 from fdi_gym.estimation.gaussian_points import (
     DISTURBANCES,
     ENTRIES,
@@ -34,7 +35,6 @@ from fdi_gym.estimation.gaussian_points import (
     TANGENT,
     THETA,
     enters,
-    factor,
     moments_of_points,
     pass_points,
     put,
@@ -42,17 +42,17 @@ from fdi_gym.estimation.gaussian_points import (
     spread,
     squared_step,
 )
+from fdi_gym.integration import LANES
 from fdi_gym.kernels import floats, helper, inlined, ints, map_at
 from fdi_gym.tangent import tangent_at
+from fdi_gym.vectors import load, store, zeros
 
 
 @helper
-def through(rule, moving, integers, reals, offset, direction, t, X, P, u, known, mean, cross, cov):
-    """N(X, P) through f (moving) or h at points: mean (m,), cov (m, m) and cross (m, N) with what went in."""
+def through(rule, moving, integers, reals, offset, direction, t, X, U, u, known, mean, cross, cov):
+    """N(X, U' U) through f (moving) or h at points: mean (m,), cov (m, m) and cross (m, N) with what went in."""
     N, m = X.size, mean.size
-    points, values = floats((2 * N + 1, N)), floats((2 * N + 1, m))
-    U, first = floats((N, N)), floats((N, m))
-    factor(P, U)
+    points, values, first = floats((2 * N + 1, N)), floats((2 * N + 1, m)), floats((N, m))
     spread(X, U, np.sqrt(squared_step(rule, N)), points)
     pass_points(moving, integers, reals, offset, direction, t, points, u, known, values)
     low = integers[STATES] if moving else 0  # of f, nobody asks for the covariance with x before
@@ -190,38 +190,50 @@ def heard(integers, reals, faults, offset, direction, plain, X, F, mean):
 
 
 @helper
-def linearised(integers, offset, direction, plant, X, u, known, F, mean):
-    """mean = f(X) and F (n_x, W) its Jacobian, for a plant x+ = g + A x + B u + G d + (E[0] + sum u_k E[1 + k]) dtheta.
+def board_lines(offset, direction, first, offsets, directions):
+    """Offset (lines, p) and direction (lines, p, n_m) of the episodes from `first` on, on their lines in turn, in lanes."""
+    for lane in range(LANES):
+        line = (first + lane) % offset.shape[0]
+        for e in range(offset.shape[1]):
+            offsets[e, lane] = offset[line, e]
+        board_one(direction[line], lane, direction.shape[2], directions)
 
-    plant (n_x, ...) has the columns [g, A, B, G, E[0], E[1], ...].
+
+@helper
+def linearised(integers, offset, direction, plant, X, u, known, N, F, mean):
+    """mean = f(X) and F (n_x N) its Jacobian, for a plant x+ = g + A x + B u + G d + (E[0] + sum u_k E[1 + k]) dtheta.
+
+    plant (n_x, ...) has the columns [g, A, B, G, E[0], E[1], ...]. All others are in lanes, as in `gaussian_algebra`.
     """
-    n_x, n_u, n_D, p, n_d, n_m = F.shape[0], u.size, known.size, offset.size, integers[DISTURBANCES], direction.shape[1]
-    B = 1 + n_x
+    n_x, n_u, n_D, p, n_d = mean.shape[0], u.shape[0], known.shape[0], offset.shape[0], integers[DISTURBANCES]
+    B, n_m = 1 + n_x, N - n_x - n_d
     G = B + n_u
     E = G + n_D
     for a in range(n_x):
-        mean[a] = plant[a, 0]
+        total = zeros() + plant[a, 0]
         for k in range(n_u):
-            mean[a] += plant[a, B + k] * u[k]
+            total += load(u, k, 0) * plant[a, B + k]
         for j in range(n_D):
-            mean[a] += plant[a, G + j] * known[j]
+            total += load(known, j, 0) * plant[a, G + j]
         for j in range(n_x):
-            F[a, j] = plant[a, 1 + j]
+            store(F, a * N + j, 0, zeros() + plant[a, 1 + j])
         for j in range(n_m):
-            F[a, n_x + j] = 0.0
+            store(F, a * N + n_x + j, 0, zeros())
         for e in range(p):
-            gain = plant[a, E + e]
+            gain = zeros() + plant[a, E + e]
             for k in range(n_u):
-                gain += u[k] * plant[a, E + (1 + k) * p + e]
-            mean[a] += gain * offset[e]
+                gain += load(u, k, 0) * plant[a, E + (1 + k) * p + e]
+            total += gain * load(offset, e, 0)
             for j in range(n_m):
-                F[a, n_x + j] += gain * direction[e, j]
+                at = a * N + n_x + j
+                store(F, at, 0, load(F, at, 0) + gain * load(direction, e * n_m + j, 0))
         for j in range(n_d):
             i = integers[SIZES + p + j]
-            F[a, n_x + n_m + j] = plant[a, G + i]
-            mean[a] -= plant[a, G + i] * known[i]  # X has it
-        for j in range(X.size):
-            mean[a] += F[a, j] * X[j]
+            store(F, a * N + n_x + n_m + j, 0, zeros() + plant[a, G + i])
+            total -= load(known, i, 0) * plant[a, G + i]  # X has it
+        for j in range(N):
+            total += load(F, a * N + j, 0) * load(X, j, 0)
+        store(mean, a, 0, total)
 
 
 @helper

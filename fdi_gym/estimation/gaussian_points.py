@@ -11,7 +11,6 @@ from fdi_gym.integration import LANES, lanes_at
 from fdi_gym.kernels import floats, helper, map_at
 
 EXTENDED, UNSCENTED, CENTRAL_DIFFERENCE = 0, 1, 2
-JITTER, RETRIES = 1e-14, 7  # added to the diagonal where the factorisation fails, times 100 at each retry
 # The integers of a model: three addresses (the last may be 0), sizes, then the lists (entries, disturbances, sensors)
 OF_LANES, OUTPUT, TANGENT, ADDRESSES = range(4)
 SUBSTEPS, STATES, OUTPUTS, THETA, KNOWN, ENTRIES, DISTURBANCES, SENSORS, OWN, COMMANDS, SIZES = range(ADDRESSES, 14)
@@ -114,36 +113,6 @@ def move_points(integers, reals, offset, direction, t, points, u, known, values)
         for lane in range(min(LANES, M - first)):
             for j in range(n_x):
                 values[first + lane, j] = X[lane, j]
-
-
-@helper
-def factor(P, U):
-    """P = U' U with the lower triangle of P; jitter only where it fails without, NaN where no jitter helps."""
-    n = P.shape[0]
-    jitter = 0.0
-    for attempt in range(RETRIES + 1):
-        for i in range(n):
-            for j in range(i, n):
-                U[i, j] = P[j, i]
-            U[i, i] += jitter
-        definite = True
-        for k in range(n):
-            if not U[k, k] > 0.0:  # also where it is no number
-                definite = False
-                break
-            U[k, k] = np.sqrt(U[k, k])
-            for j in range(k + 1, n):
-                U[k, j] /= U[k, k]
-            for i in range(k + 1, n):
-                factor = U[k, i]
-                for j in range(i, n):
-                    U[i, j] -= factor * U[k, j]
-        if definite:
-            return
-        jitter = JITTER * 100.0**attempt
-    for i in range(n):
-        for j in range(i, n):
-            U[i, j] = np.nan
 
 
 @helper
