@@ -6,8 +6,11 @@ import numpy as np
 from numba import boolean, float64, int64, void
 
 from fdi_gym.estimation.automaton import advance
-from fdi_gym.estimation.compiled import box_minimum, eliminate
-from fdi_gym.kernels import M, V, compiled, floats, helper, inlined, ints
+from fdi_gym.estimation.gaussian_algebra import board_matrices, board_vectors
+from fdi_gym.estimation.label_algebra import informative, invert, nearest_points, room
+from fdi_gym.integration import LANES
+from fdi_gym.kernels import M, V, compiled, floats, helper, inlined
+from fdi_gym.vectors import load, store
 
 I1, I2, B1, M3 = int64[::1], int64[:, ::1], boolean[::1], float64[:, :, ::1]
 SURE_AGAIN = 1.2  # times the variance before a gap
@@ -15,86 +18,60 @@ PATIENCE, PER_GAP = 20.0, 2.0  # it waits for so many samples at most, and so ma
 SETS = (I1, M, M3, M, M)  # faults, offset, direction, low, high: of the sets, as in `labels.Manifolds`
 
 
-@inlined
-def room(p, most):
-    """What `nearest_points` works in, for sets of up to `most` faults in p dimensions."""
-    G, g, ID, Io = floats((most, most)), floats(most), floats((most, p)), floats(p)
-    a, at, where, tried = floats((most, most + 1)), ints(most), ints(most), floats(most)
-    return G, g, ID, Io, a, at, where, tried
-
-
-@helper
-def nearest_points(I, Iz, faults, offset, direction, low, high, value, m, room):  # noqa: E741 (the information)
-    """value[s] = min of q' I q - 2 q' Iz over q = offset[s] + direction[s] m[s] with m[s] in its box, for all sets s."""
-    sets, p, most = direction.shape
-    G, g, ID, Io, a, at, where, tried = room
-    for s in range(sets):
-        f = faults[s]
-        base = 0.0
-        for i in range(p):
-            Io[i] = 0.0
-            for j in range(p):
-                Io[i] += I[i, j] * offset[s, j]
-            base += offset[s, i] * (Io[i] - 2.0 * Iz[i])
-        for r in range(f):
-            g[r] = 0.0
-            for i in range(p):
-                g[r] += direction[s, i, r] * (Iz[i] - Io[i])
-                ID[r, i] = 0.0
-                for j in range(p):
-                    ID[r, i] += I[i, j] * direction[s, j, r]
-            for c in range(r + 1):
-                G[r, c] = 0.0
-                for i in range(p):
-                    G[r, c] += ID[r, i] * direction[s, i, c]
-                G[c, r] = G[r, c]
-        for r in range(f, most):
-            m[s, r] = 0.0
-        value[s] = base + box_minimum(G, g, low[s], high[s], f, a, at, where, tried, m[s])
-
-
 @compiled(void(M3, M, *SETS, M, M3))
 def nearest(I, Iz, faults, offset, direction, low, high, value, m):  # noqa: E741
     """value (n, sets) and m (n, sets, f) of `nearest_points` for I (n or 1, p, p) and Iz (n, p)."""
-    work = room(direction.shape[1], direction.shape[2])
-    for e in range(len(Iz)):
-        nearest_points(I[e % len(I)], Iz[e], faults, offset, direction, low, high, value[e], m[e], work)
+    n, (sets, p, f) = len(Iz), direction.shape
+    Is, Izs, work = floats((p * p, LANES)), floats((p, LANES)), room(p, f)
+    values, at = floats((sets, LANES)), floats((sets * f, LANES))
+    for first in range(0, n, LANES):
+        if len(I) > 1 or first == 0:
+            board_matrices(I, first, Is)
+        board_vectors(Iz, first, 1, Izs)
+        nearest_points(Is, Izs, faults, offset, direction, low, high, values, at, work)
+        for lane in range(min(LANES, n - first)):
+            for s in range(sets):
+                value[first + lane, s] = values[s, lane]
+                for r in range(f):
+                    m[first + lane, s, r] = at[s * f + r, lane]
+
+
+@inlined
+def room_to_judge(direction):
+    """What `fit` works in, and what it leaves: the distance to healthy, and to the sets, with their magnitudes."""
+    sets, p, f = direction.shape
+    work = room(p, f), floats((p * p, LANES)), floats((p * p, LANES)), floats((p * p, LANES)), floats((p, LANES))
+    return work, floats((p, LANES)), floats((1, LANES)), floats((sets, LANES)), floats((sets * f, LANES))
 
 
 @helper
-def invert(P, excess, a, I):  # noqa: E741
-    """I = (P + excess)^-1; a is room to work in."""
-    for i in range(len(P)):
-        for j in range(len(P)):
-            a[i, j] = P[i, j] + excess[i, j]
-            I[i, j] = 1.0 if i == j else 0.0
-    eliminate(a, I)
-
-
-@helper
-def informative(I, z, Iz):  # noqa: E741
-    """Iz = I z, and z' I z."""
-    healthy = 0.0
-    for i in range(len(z)):
-        Iz[i] = 0.0
-        for j in range(len(z)):
-            Iz[i] += I[i, j] * z[j]
-        healthy += z[i] * Iz[i]
-    return healthy
+def fit(z, P, excess, faults, offset, direction, low, high, first, found):
+    """Squared distances of the estimates z (n, p) from `first` on to healthy and the sets, in the metric of P + excess."""
+    (of_points, Ps, a, I, Iz), zs, healthy, values, at = found  # noqa: E741
+    p = z.shape[1]
+    if len(P) > 1 or first == 0:
+        board_matrices(P, first, Ps)
+        invert(Ps, excess, p, a, I)
+    board_vectors(z, first, 1, zs)
+    store(healthy, 0, 0, informative(I, zs, p, Iz))
+    nearest_points(I, Iz, faults, offset, direction, low, high, values, at, of_points)
+    for s in range(len(faults)):
+        store(values, s, 0, load(values, s, 0) + load(healthy, 0, 0))
 
 
 @compiled(void(M, M3, M, *SETS, M, M3))
 def distances(z, P, excess, faults, offset, direction, low, high, J, m):
     """J (n, 1 + sets): squared distances of z (n, p) to healthy and each set in the metric of P (n or 1, p, p) + excess."""
-    n, p = z.shape
-    a, I, Iz, work = floats((p, p)), floats((p, p)), floats(p), room(p, direction.shape[2])  # noqa: E741
-    for e in range(n):
-        if e < len(P):
-            invert(P[e], excess, a, I)
-        J[e, 0] = informative(I, z[e], Iz)
-        nearest_points(I, Iz, faults, offset, direction, low, high, J[e, 1:], m[e], work)
-        for s in range(len(faults)):
-            J[e, 1 + s] += J[e, 0]
+    n, f, found = len(z), direction.shape[2], room_to_judge(direction)
+    _, _, healthy, values, at = found
+    for first in range(0, n, LANES):
+        fit(z, P, excess, faults, offset, direction, low, high, first, found)
+        for lane in range(min(LANES, n - first)):
+            J[first + lane, 0] = healthy[0, lane]
+            for s in range(len(faults)):
+                J[first + lane, 1 + s] = values[s, lane]
+                for r in range(f):
+                    m[first + lane, s, r] = at[s * f + r, lane]
 
 
 @helper
@@ -179,19 +156,20 @@ def judge(
     penalty, statistic, limit, after, k, informed, state, state1, label, alarm, cost, m,
 ):  # fmt: skip
     """`distances` as the costs of `declare`: of health, and of set s at labels[s]."""
-    n, p = z.shape
-    a, I, Iz, work = floats((p, p)), floats((p, p)), floats(p), room(p, direction.shape[2])  # noqa: E741
-    J = floats(len(faults))
-    for e in range(n):
-        if e < len(P):
-            invert(P[e], excess, a, I)
-        cost[e, 0] = informative(I, z[e], Iz)
-        nearest_points(I, Iz, faults, offset, direction, low, high, J, m[e], work)
-        for s in range(len(faults)):
-            cost[e, labels[s]] = J[s] + cost[e, 0]
-        if informed[e] and k[e] > after[4]:
-            declared(cost[e], penalty, statistic[e : e + 1], limit, after, state[e], state1[e])
-        else:
-            for i in range(5):
-                state1[e, i] = state[e, i]
-        label[e], alarm[e] = state1[e, 0], state1[e, 0] > 0
+    n, f, found = len(z), direction.shape[2], room_to_judge(direction)
+    _, _, healthy, values, at = found
+    for first in range(0, n, LANES):
+        fit(z, P, excess, faults, offset, direction, low, high, first, found)
+        for lane in range(min(LANES, n - first)):
+            e = first + lane
+            cost[e, 0] = healthy[0, lane]
+            for s in range(len(faults)):
+                cost[e, labels[s]] = values[s, lane]
+                for r in range(f):
+                    m[e, s, r] = at[s * f + r, lane]
+            if informed[e] and k[e] > after[4]:
+                declared(cost[e], penalty, statistic[e : e + 1], limit, after, state[e], state1[e])
+            else:
+                for i in range(5):
+                    state1[e, i] = state[e, i]
+            label[e], alarm[e] = state1[e, 0], state1[e, 0] > 0
