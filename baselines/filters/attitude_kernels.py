@@ -3,7 +3,7 @@
 import numpy as np
 from numba import float64, int64, void
 
-from fdi_gym.estimation.gaussian_algebra import board_matrices, disembark, factor
+from fdi_gym.estimation.gaussian_algebra import board_matrices, factor, take_matrix
 from fdi_gym.estimation.gaussian_points import UNSCENTED, moments_of_points, spread, squared_step
 from fdi_gym.integration import LANES, lanes_at
 from fdi_gym.kernels import M, V, compiled, floats, helper
@@ -41,7 +41,7 @@ def predict(lanes_address, dt, substeps, physical, X, P, sign, u, Q, X1, P1, sig
         if e % LANES == 0:
             board_matrices(P, e, Ps)
             factor(Ps, N, Us)
-        disembark(Us, N, e % LANES, U)
+        take_matrix(Us, e % LANES, U)
         spread(X[e], U, np.sqrt(squared_step(UNSCENTED, N)), points)
         for lane in range(LANES):
             for j in range(n_theta):

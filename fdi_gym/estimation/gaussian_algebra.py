@@ -9,10 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from fdi_gym.integration import LANES
-from fdi_gym.kernels import helper
+from fdi_gym.kernels import floats, helper
 from fdi_gym.vectors import above, choose, filled, load, root, store, zeros
 
-LOG_2PI = float(np.log(2 * np.pi))
 JITTER, RETRIES = 1e-14, 7  # added to the diagonal where the factorisation fails, times 100 at each retry
 
 
@@ -44,31 +43,30 @@ def board_one(given, lane, columns, into):
 
 
 @helper
-def disembark(A, n, lane, into):
-    """The matrix (n n) of a lane into (n, n)."""
-    for i in range(n):
-        for j in range(n):
-            into[i, j] = A[i * n + j, lane]
+def take_vector(A, lane, into):
+    """The vector of a lane into (n,)."""
+    for i in range(into.size):
+        into[i] = A[i, lane]
 
 
 @helper
-def put_ashore(e, lane, P, seen, distances, U, X, nu, S, X1, P1, nu1, S1, distance, log):
-    """Episode e of what `correct` has left in a lane, with the log density of what its sensors read; how many reported."""
-    N, m, count, density = X.shape[0], nu.shape[0], 0, 0.0
-    for i in range(N):
-        X1[e, i] = X[i, lane]
-        for j in range(i + 1):
-            P1[e, i, j] = P1[e, j, i] = P[i * N + j, lane]
-    for a in range(m):
-        nu1[e, a] = nu[a, lane]
-        for b in range(a + 1):
-            S1[e, a, b] = S1[e, b, a] = S[a * m + b, lane]
-        if seen[a, lane] > 0.0:
-            count += 1
-            density -= 0.5 * LOG_2PI + np.log(U[a * m + a, lane])
-    distance[e] = distances[0, lane]
-    log[e] = density - 0.5 * distance[e]
-    return count
+def take_matrix(A, lane, into):
+    """The matrix of a lane into (r, c)."""
+    for i in range(into.shape[0]):
+        for j in range(into.shape[1]):
+            into[i, j] = A[i * into.shape[1] + j, lane]
+
+
+@helper
+def entry(given, row, i, j):
+    """Entry (i, j) of matrices (rows, r, c) that serve episodes in turn, the first lane's being number `row`."""
+    found = zeros() + given[0, i, j]
+    if given.shape[0] > 1:
+        lanes = floats((1, LANES))
+        for lane in range(LANES):
+            lanes[0, lane] = given[(row + lane) % given.shape[0], i, j]
+        found = load(lanes, 0, 0)
+    return found
 
 
 @helper
@@ -112,6 +110,26 @@ def entries_of(F, m, N, where, many):
 
 
 @helper
+def through_rows(H, P, cross, cov):
+    """`through_matrix` for a matrix H (m, N) that is the same for all."""
+    m, N = H.shape
+    for a in range(m):
+        for c in range(N):
+            total = zeros()
+            for j in range(N):
+                if H[a, j] != 0.0:
+                    total += load(P, j * N + c, 0) * H[a, j]
+            store(cross, a * N + c, 0, total)
+    for a in range(m):
+        for b in range(a + 1):
+            total = zeros()
+            for j in range(N):
+                if H[b, j] != 0.0:
+                    total += load(cross, a * N + j, 0) * H[b, j]
+            store(cov, a * m + b, 0, total)
+
+
+@helper
 def through_matrix(F, P, m, N, where, many, cross, cov):
     """cross = F P (m N) and the lower triangle of cov = F P F' (m m) for F (m N), most of which may be 0 (`entries_of`)."""
     for a in range(m):
@@ -131,24 +149,52 @@ def through_matrix(F, P, m, N, where, many, cross, cov):
 
 
 @helper
-def correct(X, P, y, seen, mean, S, cross, m, N, U, white, X1, nu, S1):
-    """The Kalman correction by the sensors that reported (seen > 0): nu' S^-1 nu.
+def predicted(row, mean, cross, cov, Q, limit, X, P):
+    """X and P become those one sample later: what f moves has mean and covariance cov, and cross with the rest, which stays.
 
-    A sensor that did not report has nu = 0, no covariance with anything and S = 1. X1 is the new mean, and of P (N N) the
-    lower triangle the new covariance's; S1 has a lower triangle, S1 = U' U, white becomes U'^-1 nu and cross (m N)
-    U'^-1 cross.
+    Q (rows, N, N) comes upon it, the first lane's being number `row`; a variance beyond its limit is shrunk to it.
     """
+    n_x, N = mean.shape[0], X.shape[0]
+    for i in range(N):
+        if i < n_x:
+            store(X, i, 0, load(mean, i, 0))
+        for j in range(i + 1):
+            if i < n_x:
+                total = load(cov, i * n_x + j, 0)
+            elif j < n_x:
+                total = load(cross, j * N + i, 0)
+            else:
+                total = (load(P, i * N + j, 0) + load(P, j * N + i, 0)) * 0.5
+            total += entry(Q, row, i, j)
+            store(P, i * N + j, 0, total)
+            store(P, j * N + i, 0, total)
+    for i in range(N):
+        variance = load(P, i * N + i, 0)
+        if above(variance - limit[i]):
+            shrink = choose(variance - limit[i], root((zeros() + limit[i]) / variance), 1.0)
+            for j in range(N):
+                store(P, i * N + j, 0, load(P, i * N + j, 0) * shrink)
+                store(P, j * N + i, 0, load(P, j * N + i, 0) * shrink)
+
+
+@helper
+def correct(X, P, y, seen, mean, S, cross, U, white, nu, S1):
+    """X and P become those after the sensors that reported (seen > 0), with the moments mean, S and cross (m N).
+
+    Returns nu' S^-1 nu. A sensor that did not report has nu = 0, no covariance with anything and S = 1. S1 = U' U,
+    white becomes U'^-1 nu and cross U'^-1 cross; of U there is the upper triangle.
+    """
+    m, N, distance = mean.shape[0], X.shape[0], zeros()
     for a in range(m):
         there = load(seen, a, 0)
         store(nu, a, 0, choose(there, load(y, a, 0) - load(mean, a, 0), 0.0))
         for b in range(a + 1):
             both = choose(there, load(seen, b, 0), 0.0)
-            store(S1, a * m + b, 0, choose(both, 0.5 * (load(S, a * m + b, 0) + load(S, b * m + a, 0)), 0.0))
+            total = choose(both, (load(S, a * m + b, 0) + load(S, b * m + a, 0)) * 0.5, 0.0)
+            store(S1, a * m + b, 0, total)
+            store(S1, b * m + a, 0, total)
         store(S1, a * m + a, 0, choose(there, load(S1, a * m + a, 0), 1.0))
     factor(S1, m, U)
-    distance = zeros()
-    for i in range(N):
-        store(X1, i, 0, load(X, i, 0))
     for a in range(m):
         there, pivot, total = load(seen, a, 0), load(U, a * m + a, 0), load(nu, a, 0)
         for b in range(a):
@@ -162,11 +208,12 @@ def correct(X, P, y, seen, mean, S, cross, m, N, U, white, X1, nu, S1):
                 found -= load(U, b * m + a, 0) * load(cross, b * N + i, 0)
             found = choose(there, found / pivot, 0.0)
             store(cross, a * N + i, 0, found)
-            store(X1, i, 0, load(X1, i, 0) + total * found)
+            store(X, i, 0, load(X, i, 0) + total * found)
     for i in range(N):
         for j in range(i + 1):
-            left = 0.5 * (load(P, i * N + j, 0) + load(P, j * N + i, 0))
+            left = (load(P, i * N + j, 0) + load(P, j * N + i, 0)) * 0.5
             for a in range(m):
                 left -= load(cross, a * N + i, 0) * load(cross, a * N + j, 0)
             store(P, i * N + j, 0, left)
+            store(P, j * N + i, 0, left)
     return distance

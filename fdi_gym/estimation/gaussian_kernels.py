@@ -5,37 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numba import boolean, float64, int64, void
 
-from fdi_gym.estimation.gaussian_algebra import (
-    board_matrices,
-    board_one,
-    board_vectors,
-    disembark,
-    entries_of,
-    factor,
-    put_ashore,
-    through_matrix,
-)
+from fdi_gym.estimation.gaussian_algebra import board_matrices, board_vectors, take_matrix, take_vector
 from fdi_gym.estimation.gaussian_algebra import correct as correct_lanes
-from fdi_gym.estimation.gaussian_moments import (
-    board_lines,
-    differenced,
-    differentiated,
-    heard,
-    linearised,
-    own_faults,
-    room_of,
-    sensed,
-    through,
-)
-from fdi_gym.estimation.gaussian_points import COMMANDS, EXTENDED, KNOWN, OUTPUTS, SENSORS, STATES, TANGENT, pass_points
+from fdi_gym.estimation.gaussian_moments import differentiated, room_of
+from fdi_gym.estimation.gaussian_points import COMMANDS, KNOWN, SENSORS, STATES, pass_points
+from fdi_gym.estimation.gaussian_step import MODEL, hear, move, room_to_hear, room_to_predict
 from fdi_gym.integration import LANES
-from fdi_gym.kernels import M, V, compiled, floats, helper, ints
+from fdi_gym.kernels import M, V, compiled, floats, helper, inlined
 from fdi_gym.tangent import row
-from fdi_gym.vectors import load, store, width, zeros
+from fdi_gym.vectors import load, store
 
 I1, B2, M3 = int64[::1], boolean[:, ::1], float64[:, :, ::1]
-# integers, reals, step, offset, direction: the constants of a model that tell its f and h, as `gaussian.bind` packs them
-MODEL = (I1, V, V, M, M3)
+LOG_2PI = float(np.log(2 * np.pi))
 
 
 @helper
@@ -62,76 +43,48 @@ def _check_sensors(n, m, y, seen):
         raise ValueError("y and seen need a row for each episode, or for equally many, and one entry for each sensor")
 
 
+@inlined
+def room_aboard(N, integers):
+    """X, P, t, u and what is known of the disturbances, in lanes."""
+    P = floats((N * N, LANES))
+    return floats((N, LANES)), P, floats(LANES), floats((integers[COMMANDS], LANES)), floats((integers[KNOWN], LANES))
+
+
+@helper
+def aboard(first, X, P, t, u, known, lanes):
+    """Take the episodes from `first` on into lanes; t, u and known may have fewer rows, each for as many episodes."""
+    Xs, Ps, ts, us, ds = lanes
+    n = X.shape[0]
+    board_vectors(X, first, 1, Xs)
+    board_matrices(P, first, Ps)
+    board_vectors(u, first, n // u.shape[0], us)
+    board_vectors(known, first, n // known.shape[0], ds)
+    for lane in range(LANES):
+        ts[lane] = t[min(first + lane, n - 1) * t.size // n]
+
+
+@helper
+def ashore(first, Xs, Ps, X1, P1):
+    """Put X and P of the lanes back, from episode `first` on."""
+    for lane in range(min(LANES, X1.shape[0] - first)):
+        take_vector(Xs, lane, X1[first + lane])
+        take_matrix(Ps, lane, P1[first + lane])
+
+
 @compiled(void(int64, *MODEL, V, M, M, M3, V, M, M, M3, M, M3))
 def predict(rule, integers, reals, step, offset, direction, limit, plant, X, P, t, u, known, Q, X1, P1):
     """X1 and P1 one sample after X (n, N) and P (n, N, N)."""
-    (n, N), n_x, lines = X.shape, integers[STATES], offset.shape[0]
+    n, N = X.shape
     if n == 0:
         return
     _check(integers, step, n, N, t, u, known)
     _check_covariances(n, P, N, Q, N)
-    linear, points = plant.shape[0] > 0, plant.shape[0] == 0 and rule != EXTENDED
-    alike_u, alike_d = n // u.shape[0], n // known.shape[0]
-    Xs, Ps, means = floats((N, LANES)), floats((N * N, LANES)), floats((n_x, LANES))
-    Fs, cross, cov = floats((n_x * N, LANES)), floats((n_x * N, LANES)), floats((n_x * n_x, LANES))
-    where, many = ints((n_x, N)), ints(n_x)
-    us, ds = floats((u.shape[1] if linear else 0, LANES)), floats((known.shape[1] if linear else 0, LANES))
-    size = direction.shape[2] if linear else 0
-    offsets, directions = floats((offset.shape[1], LANES)), floats((offset.shape[1] * size, LANES))
-    Us, U = floats((N * N if points else 0, LANES)), floats((N, N) if points else (0, 0))
-    mean, F, room = floats(n_x), floats((n_x, row(N))), room_of(integers, reals, row(N))
-    of_one, across = floats((n_x, N)), floats((n_x, n_x))
+    room, lanes = room_to_predict(rule, integers, reals, plant, N), room_aboard(N, integers)
+    Xs, Ps, ts, us, ds = lanes
     for first in range(0, n, LANES):
-        board_matrices(P, first, Ps)
-        if points:
-            factor(Ps, N, Us)
-        if linear:
-            board_vectors(X, first, 1, Xs)
-            board_vectors(u, first, alike_u, us)
-            board_vectors(known, first, alike_d, ds)
-            if lines > 1 or first == 0:
-                board_lines(offset, direction, first, offsets, directions)
-            linearised(integers, offsets, directions, plant, Xs, us, ds, N, Fs, means)
-        for lane in range(LANES if not linear else 0):
-            e = min(first + lane, n - 1)
-            line, te = e % lines, t[e * t.size // n]
-            Xe, ue, de = X[e], u[e // alike_u], known[e // alike_d]
-            if points:
-                disembark(Us, N, lane, U)
-                through(rule, True, integers, reals, offset[line], direction[line], te, Xe, U, ue, de, mean, of_one, across)
-                board_one(of_one, lane, N, cross)
-                board_one(across, lane, n_x, cov)
-            elif integers[TANGENT] != 0:
-                differentiated(integers, reals, step, offset[line], direction[line], te, Xe, ue, de, room, F, mean)
-                board_one(F, lane, N, Fs)
-            else:
-                differenced(integers, reals, step, offset[line], direction[line], te, Xe, ue, de, F, mean)
-                board_one(F, lane, N, Fs)
-            for i in range(n_x):
-                means[i, lane] = mean[i]
-        if not points:
-            if not linear or first == 0:
-                entries_of(Fs, n_x, N, where, many)
-            through_matrix(Fs, Ps, n_x, N, where, many, cross, cov)
-        for lane in range(min(LANES, n - first)):
-            e = first + lane
-            Qe, Pe, P1e = Q[e % Q.shape[0]], P[e], P1[e]
-            for i in range(n_x):
-                X1[e, i] = means[i, lane]
-                for j in range(i + 1):
-                    P1e[i, j] = P1e[j, i] = cov[i * n_x + j, lane] + Qe[i, j]
-            for i in range(n_x, N):
-                X1[e, i] = X[e, i]
-                for j in range(n_x):
-                    P1e[i, j] = P1e[j, i] = cross[j * N + i, lane] + Qe[i, j]
-                for j in range(n_x, i + 1):
-                    P1e[i, j] = P1e[j, i] = 0.5 * (Pe[i, j] + Pe[j, i]) + Qe[i, j]
-            for i in range(N):
-                if P1e[i, i] > limit[i]:
-                    shrink = np.sqrt(limit[i] / P1e[i, i])
-                    for j in range(N):
-                        P1e[i, j] *= shrink
-                        P1e[j, i] *= shrink
+        aboard(first, X, P, t, u, known, lanes)
+        move(rule, integers, reals, step, offset, direction, limit, plant, first, Xs, Ps, ts, us, ds, Q, room)
+        ashore(first, Xs, Ps, X1, P1)
 
 
 @compiled(void(*MODEL, M, V, M, M, M, M3))
@@ -152,75 +105,58 @@ def differentiate(integers, reals, step, offset, direction, X, t, u, known, X1, 
                 F[e, i, j] = moved[i, j] if i < n_x else (1.0 if i == j else 0.0)
 
 
+@inlined
+def room_of_update(N, m):
+    """What sensors read, which of them reported, nu, S, its factor and the distance, in lanes."""
+    S, U = floats((m * m, LANES)), floats((m * m, LANES))
+    return floats((m, LANES)), floats((m, LANES)), floats((m, LANES)), S, U, floats((1, LANES))
+
+
+@helper
+def updated(first, there, nus, Ss, Us, distances, nu, S, distance, log):
+    """Put back what lanes found of the sensors, with the log density of what they read, from episode `first` on."""
+    m = nu.shape[1]
+    for lane in range(min(LANES, nu.shape[0] - first)):
+        e, density = first + lane, 0.0
+        take_vector(nus, lane, nu[e])
+        take_matrix(Ss, lane, S[e])
+        for a in range(m):
+            if there[a, lane] > 0.0:
+                density -= 0.5 * LOG_2PI + np.log(Us[a * m + a, lane])
+        distance[e] = distances[0, lane]
+        log[e] = density - 0.5 * distance[e]
+
+
 @compiled(void(int64, *MODEL, M, M, B2, I1, M, M3, V, M, M, M, M3, M, M3, M, M3, V, V))
 def update(
     rule, integers, reals, step, offset, direction, H, plain, seen, count, X, P, t, u, known, y, R,
     X1, P1, nu, S, distance, log,
 ):  # fmt: skip
     """X1 and P1 after the sensors y (n, m) at t, of which `seen` reported."""
-    (n, N), m, lines = X.shape, integers[SENSORS], offset.shape[0]
+    (n, N), m = X.shape, integers[SENSORS]
     if n == 0:
         return
     _check(integers, step, n, N, t, u, known)
     _check_covariances(n, P, N, R, m)
     _check_sensors(n, m, y, seen)
-    fixed, points = H.shape[0] > 0, H.shape[0] == 0 and rule != EXTENDED
-    alike, alike_u, alike_d = n // y.shape[0], n // u.shape[0], n // known.shape[0]
-    Xs, Ps, means, ys = floats((N, LANES)), floats((N * N, LANES)), floats((m, LANES)), floats((m, LANES))
-    Fs, cross, Ss = floats((m * N, LANES)), floats((m * N, LANES)), floats((m * m, LANES))
-    there, white, where, many = floats((m, LANES)), floats((m, LANES)), ints((m, N)), ints(m)
-    X1s, nus, S1s, Us = floats((N, LANES)), floats((m, LANES)), floats((m * m, LANES)), floats((m * m, LANES))
-    factors, U = floats((N * N if points else 0, LANES)), floats((N, N) if points else (0, 0))
-    mean, F, faults = floats(m), floats((m, N)), own_faults(integers)
-    across, distances = floats((m, m)), floats((1, LANES))
-    room, x, values = room_of(integers, reals, width(N)), floats(N), floats(integers[OUTPUTS])
-    if fixed:
-        for lane in range(LANES):
-            board_one(H, lane, N, Fs)
-        entries_of(Fs, m, N, where, many)
-    for first in range(0, n, LANES):
-        board_vectors(X, first, 1, Xs)
-        board_matrices(P, first, Ps)
-        board_vectors(y, first, alike, ys)
-        board_vectors(seen, first, alike, there)
-        if points:
-            factor(Ps, N, factors)
-        if fixed:
-            for a in range(m):
-                total = zeros()
-                for s in range(many[a]):
-                    total += load(Fs, a * N + where[a, s], 0) * load(Xs, where[a, s], 0)
-                store(means, a, 0, total)
-        for lane in range(LANES if not fixed else 0):
-            e = min(first + lane, n - 1)
-            line, te = e % lines, t[e * t.size // n]
-            ue, de = u[e // alike_u], known[e // alike_d]
-            if points:
-                disembark(factors, N, lane, U)
-                through(rule, False, integers, reals, offset[line], direction[line], te, X[e], U, ue, de, mean, F, across)
-                board_one(F, lane, N, cross)
-                board_one(across, lane, m, Ss)
-            else:
-                if plain.shape[0] > 0:
-                    heard(integers, reals, faults, offset[line], direction[line], plain, X[e], F, mean)
-                else:
-                    sensed(integers, reals, step, offset[line], direction[line], te, X[e], ue, de, room, x, values, F, mean)
-                board_one(F, lane, N, Fs)
-            for a in range(m):
-                means[a, lane] = mean[a]
-        if not points:
-            if not fixed:
-                entries_of(Fs, m, N, where, many)
-            through_matrix(Fs, Ps, m, N, where, many, cross, Ss)
+    room, lanes = room_to_hear(rule, integers, reals, H, N), room_aboard(N, integers)
+    Xs, Ps, ts, us, ds = lanes
+    ys, there, nus, Ss, Us, distances = room_of_update(N, m)
+    for e in range(n):
+        count[e] = 0
         for a in range(m):
-            for b in range(a + 1):
-                for lane in range(LANES):
-                    Re, total = R[min(first + lane, n - 1) % R.shape[0]], Ss[a * m + b, lane]
-                    Ss[a * m + b, lane] = total + Re[a, b]
-                    Ss[b * m + a, lane] = total + Re[b, a]
-        store(distances, 0, 0, correct_lanes(Xs, Ps, ys, there, means, Ss, cross, m, N, Us, white, X1s, nus, S1s))
-        for lane in range(min(LANES, n - first)):
-            count[first + lane] = put_ashore(first + lane, lane, Ps, there, distances, Us, X1s, nus, S1s, X1, P1, nu, S, distance, log)
+            count[e] += seen[e * y.shape[0] // n, a]
+    for first in range(0, n, LANES):
+        aboard(first, X, P, t, u, known, lanes)
+        board_vectors(y, first, n // y.shape[0], ys)
+        board_vectors(seen, first, n // y.shape[0], there)
+        found = hear(
+            rule, integers, reals, step, offset, direction, H, plain, first, Xs, Ps, ts, us, ds, ys, there, R, room,
+            nus, Ss, Us,
+        )  # fmt: skip
+        store(distances, 0, 0, found)
+        ashore(first, Xs, Ps, X1, P1)
+        updated(first, there, nus, Ss, Us, distances, nu, S, distance, log)
 
 
 @compiled(void(B2, M, M3, M, M, M3, M3, M, M3, M, M3, M3, V, V))
@@ -232,35 +168,33 @@ def correct(seen, X, P, y, mean, cross, S, X1, P1, nu, S1, K, distance, log):
     if mean.shape[0] != n or cross.shape != (n, N, m) or S.shape != (n, m, m) or P.shape != (n, N, N):
         raise ValueError("the shapes are X (n, N), P (n, N, N), mean (n, m), cross (n, N, m) and S (n, m, m)")
     _check_sensors(n, m, y, seen)
-    alike = n // y.shape[0]
-    Xs, Ps, means, ys = floats((N, LANES)), floats((N * N, LANES)), floats((m, LANES)), floats((m, LANES))
-    across, Ws, Ss = floats((N * m, LANES)), floats((m * N, LANES)), floats((m * m, LANES))
-    there, white, distances = floats((m, LANES)), floats((m, LANES)), floats((1, LANES))
-    X1s, nus, S1s, Us = floats((N, LANES)), floats((m, LANES)), floats((m * m, LANES)), floats((m * m, LANES))
+    Xs, Ps, means, Ws = floats((N, LANES)), floats((N * N, LANES)), floats((m, LANES)), floats((N * m, LANES))
+    cov, across, white = floats((m * m, LANES)), floats((m * N, LANES)), floats((m, LANES))
+    ys, there, nus, Ss, Us, distances = room_of_update(N, m)
     for first in range(0, n, LANES):
         board_vectors(X, first, 1, Xs)
         board_matrices(P, first, Ps)
-        board_vectors(y, first, alike, ys)
-        board_vectors(seen, first, alike, there)
+        board_vectors(y, first, n // y.shape[0], ys)
+        board_vectors(seen, first, n // y.shape[0], there)
         board_vectors(mean, first, 1, means)
-        board_matrices(cross, first, across)
-        board_matrices(S, first, Ss)
+        board_matrices(cross, first, Ws)
+        board_matrices(S, first, cov)
         for a in range(m):
             for i in range(N):
-                store(Ws, a * N + i, 0, load(across, i * m + a, 0))
-        store(distances, 0, 0, correct_lanes(Xs, Ps, ys, there, means, Ss, Ws, m, N, Us, white, X1s, nus, S1s))
+                store(across, a * N + i, 0, load(Ws, i * m + a, 0))
+        store(distances, 0, 0, correct_lanes(Xs, Ps, ys, there, means, cov, across, Us, white, nus, Ss))
+        ashore(first, Xs, Ps, X1, P1)
+        updated(first, there, nus, Ss, Us, distances, nu, S1, distance, log)
         for a in range(m - 1, -1, -1):  # K' = U^-1 W
             for i in range(N):
-                gain = load(Ws, a * N + i, 0)
+                gain = load(across, a * N + i, 0)
                 for b in range(a + 1, m):
-                    gain -= load(Us, a * m + b, 0) * load(Ws, b * N + i, 0)
-                store(Ws, a * N + i, 0, gain / load(Us, a * m + a, 0))
+                    gain -= load(Us, a * m + b, 0) * load(across, b * N + i, 0)
+                store(across, a * N + i, 0, gain / load(Us, a * m + a, 0))
         for lane in range(min(LANES, n - first)):
-            e = first + lane
-            put_ashore(e, lane, Ps, there, distances, Us, X1s, nus, S1s, X1, P1, nu, S1, distance, log)
             for a in range(m):
                 for i in range(N):
-                    K[e, i, a] = Ws[a * N + i, lane]
+                    K[first + lane, i, a] = across[a * N + i, lane]
 
 
 @compiled(void(boolean, *MODEL, M3, V, M, M, M3))

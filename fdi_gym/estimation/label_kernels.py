@@ -10,7 +10,7 @@ from fdi_gym.estimation.gaussian_algebra import board_matrices, board_vectors
 from fdi_gym.estimation.label_algebra import informative, invert, nearest_points, room
 from fdi_gym.integration import LANES
 from fdi_gym.kernels import M, V, compiled, floats, helper, inlined
-from fdi_gym.vectors import load, store
+from fdi_gym.vectors import load, store, zeros
 
 I1, I2, B1, M3 = int64[::1], int64[:, ::1], boolean[::1], float64[:, :, ::1]
 SURE_AGAIN = 1.2  # times the variance before a gap
@@ -37,23 +37,24 @@ def nearest(I, Iz, faults, offset, direction, low, high, value, m):  # noqa: E74
 
 
 @inlined
-def room_to_judge(direction):
+def room_to_fit(direction):
     """What `fit` works in, and what it leaves: the distance to healthy, and to the sets, with their magnitudes."""
     sets, p, f = direction.shape
-    work = room(p, f), floats((p * p, LANES)), floats((p * p, LANES)), floats((p * p, LANES)), floats((p, LANES))
-    return work, floats((p, LANES)), floats((1, LANES)), floats((sets, LANES)), floats((sets * f, LANES))
+    inner = room(p, f), floats((p * p, LANES)), floats((p * p, LANES)), floats((p, LANES))
+    return inner, floats((1, LANES)), floats((sets, LANES)), floats((sets * f, LANES))
 
 
 @helper
-def fit(z, P, excess, faults, offset, direction, low, high, first, found):
-    """Squared distances of the estimates z (n, p) from `first` on to healthy and the sets, in the metric of P + excess."""
-    (of_points, Ps, a, I, Iz), zs, healthy, values, at = found  # noqa: E741
-    p = z.shape[1]
-    if len(P) > 1 or first == 0:
-        board_matrices(P, first, Ps)
-        invert(Ps, excess, p, a, I)
-    board_vectors(z, first, 1, zs)
-    store(healthy, 0, 0, informative(I, zs, p, Iz))
+def fit(z, P, excess, faults, offset, direction, low, high, known, found):
+    """Squared distances of the estimates z (p) to healthy and the sets, in the metric of P (p p) + excess, in lanes.
+
+    known: P and excess are those of the last call.
+    """
+    (of_points, a, I, Iz), healthy, values, at = found  # noqa: E741
+    p = z.shape[0]
+    if not known:
+        invert(P, excess, p, a, I)
+    store(healthy, 0, 0, informative(I, z, p, Iz))
     nearest_points(I, Iz, faults, offset, direction, low, high, values, at, of_points)
     for s in range(len(faults)):
         store(values, s, 0, load(values, s, 0) + load(healthy, 0, 0))
@@ -62,10 +63,12 @@ def fit(z, P, excess, faults, offset, direction, low, high, first, found):
 @compiled(void(M, M3, M, *SETS, M, M3))
 def distances(z, P, excess, faults, offset, direction, low, high, J, m):
     """J (n, 1 + sets): squared distances of z (n, p) to healthy and each set in the metric of P (n or 1, p, p) + excess."""
-    n, f, found = len(z), direction.shape[2], room_to_judge(direction)
-    _, _, healthy, values, at = found
+    (n, p), f, found = z.shape, direction.shape[2], room_to_fit(direction)
+    zs, Ps, (_, healthy, values, at) = floats((p, LANES)), floats((p * p, LANES)), found
     for first in range(0, n, LANES):
-        fit(z, P, excess, faults, offset, direction, low, high, first, found)
+        board_vectors(z, first, 1, zs)
+        board_matrices(P, first, Ps)
+        fit(zs, Ps, excess, faults, offset, direction, low, high, first > 0 and len(P) == 1, found)
         for lane in range(min(LANES, n - first)):
             J[first + lane, 0] = healthy[0, lane]
             for s in range(len(faults)):
@@ -100,18 +103,35 @@ def gain(cost, penalty):
 
 
 @helper
-def declared(cost, penalty, statistic, limit, after, state, state1):
+def declared(cost, penalty, statistic, limit, after, k, informed, state, state1):
     """An automaton, the five integers of `automaton.advance`, one sample later, as of `declare`; statistic (1,) or (0,)."""
-    rise, switch, release, same = after[0], after[1], after[2], after[3] > 0
-    if same:  # health is a label like the others
-        best = lowest(cost, penalty, 0)
-        above, below = best > 0, False
-    else:
-        best, share = lowest(cost, penalty, 1), gain(cost, penalty)
-        above, below = statistic[0] > limit if statistic.size else share > 1.0, share < 0.5
     label, over, other, under, last = state[0], state[1], state[2], state[3], state[4]
-    new = advance(label, over, other, under, last, best, above, below, rise, switch, release, same)
-    state1[0], state1[1], state1[2], state1[3], state1[4] = new
+    if informed and k > after[4]:
+        rise, switch, release, same = after[0], after[1], after[2], after[3] > 0
+        if same:  # health is a label like the others
+            best = lowest(cost, penalty, 0)
+            above, below = best > 0, False
+        else:
+            best, share = lowest(cost, penalty, 1), gain(cost, penalty)
+            above, below = statistic[0] > limit if statistic.size else share > 1.0, share < 0.5
+        label, over, other, under, last = advance(
+            label, over, other, under, last, best, above, below, rise, switch, release, same
+        )
+    state1[0], state1[1], state1[2], state1[3], state1[4] = label, over, other, under, last
+
+
+@helper
+def sure_again(informed, variances, state, state1):
+    """Whether a sample counts, as of `wait`; variances (p,)."""
+    still, patience, unsure = state[0] > 0.0, state[1], False
+    for i in range(variances.size):
+        unsure = unsure or variances[i] > SURE_AGAIN * state[2 + i]
+    still = not informed or (still and unsure and patience > 0.0)
+    state1[0] = still
+    state1[1] = patience + (-1.0 if informed else PER_GAP) if still else PATIENCE
+    for i in range(variances.size):
+        state1[2 + i] = state[2 + i] if still else variances[i]
+    return not still
 
 
 @compiled(void(M3, B1, M, M, B1))
@@ -121,17 +141,11 @@ def wait(P, informed, state, state1, counts):
     `informed` (n,): some sensor reported. The state (n, 2 + p): whether it is waited, for how many samples with reports at
     most, and the variances of the estimate when a sample last counted; P (n, p, p) has those of now.
     """
-    p = P.shape[1]
+    variances = floats(P.shape[1])
     for e in range(len(counts)):
-        still, patience = state[e, 0] > 0.0, state[e, 1]
-        unsure = False
-        for i in range(p):
-            unsure = unsure or P[e, i, i] > SURE_AGAIN * state[e, 2 + i]
-        still = not informed[e] or (still and unsure and patience > 0.0)
-        counts[e], state1[e, 0] = not still, still
-        state1[e, 1] = patience + (-1.0 if informed[e] else PER_GAP) if still else PATIENCE
-        for i in range(p):
-            state1[e, 2 + i] = state[e, 2 + i] if still else P[e, i, i]
+        for i in range(variances.size):
+            variances[i] = P[e, i, i]
+        counts[e] = sure_again(informed[e], variances, state[e], state1[e])
 
 
 @compiled(void(M, V, V, float64, I1, I1, B1, I2, I2, I1, B1))
@@ -142,11 +156,7 @@ def declare(cost, penalty, statistic, limit, after, k, informed, state, state1, 
     switch, release, same and warmup of a persistence.
     """
     for e in range(len(cost)):
-        if informed[e] and k[e] > after[4]:
-            declared(cost[e], penalty, statistic[e : e + 1], limit, after, state[e], state1[e])
-        else:
-            for i in range(5):
-                state1[e, i] = state[e, i]
+        declared(cost[e], penalty, statistic[e : e + 1], limit, after, k[e], informed[e], state[e], state1[e])
         label[e], alarm[e] = state1[e, 0], state1[e, 0] > 0
 
 
@@ -156,10 +166,12 @@ def judge(
     penalty, statistic, limit, after, k, informed, state, state1, label, alarm, cost, m,
 ):  # fmt: skip
     """`distances` as the costs of `declare`: of health, and of set s at labels[s]."""
-    n, f, found = len(z), direction.shape[2], room_to_judge(direction)
-    _, _, healthy, values, at = found
+    (n, p), f, found = z.shape, direction.shape[2], room_to_fit(direction)
+    zs, Ps, (_, healthy, values, at) = floats((p, LANES)), floats((p * p, LANES)), found
     for first in range(0, n, LANES):
-        fit(z, P, excess, faults, offset, direction, low, high, first, found)
+        board_vectors(z, first, 1, zs)
+        board_matrices(P, first, Ps)
+        fit(zs, Ps, excess, faults, offset, direction, low, high, first > 0 and len(P) == 1, found)
         for lane in range(min(LANES, n - first)):
             e = first + lane
             cost[e, 0] = healthy[0, lane]
@@ -167,9 +179,28 @@ def judge(
                 cost[e, labels[s]] = values[s, lane]
                 for r in range(f):
                     m[e, s, r] = at[s * f + r, lane]
-            if informed[e] and k[e] > after[4]:
-                declared(cost[e], penalty, statistic[e : e + 1], limit, after, state[e], state1[e])
-            else:
-                for i in range(5):
-                    state1[e, i] = state[e, i]
+            declared(cost[e], penalty, statistic[e : e + 1], limit, after, k[e], informed[e], state[e], state1[e])
             label[e], alarm[e] = state1[e, 0], state1[e, 0] > 0
+
+
+@compiled(void(M, M, M, boolean, I1, *SETS, V, float64, I1, I1, B1, I2, M))
+def decide_lanes(
+    z, P, excess, fixed, labels, faults, offset, direction, low, high, penalty, limit, after, k, informed, state, waiting
+):  # fmt: skip
+    """`wait` and `judge` for whoever has its estimates in lanes: state (LANES, 5) and waiting are brought up to the sample.
+
+    z (p, LANES) and P (p p, LANES), or where `fixed`, excess alone is the metric.
+    """
+    p, found = z.shape[0], room_to_fit(direction)
+    cost, variances, nothing, metric, (_, healthy, values, _) = floats(penalty.size), floats(p), floats(0), floats(P.shape), found
+    for i in range(p * p):
+        store(metric, i, 0, zeros() if fixed else load(P, i, 0))
+    fit(z, metric, excess, faults, offset, direction, low, high, False, found)
+    for lane in range(LANES):
+        for i in range(p):
+            variances[i] = P[i * (p + 1), lane]
+        cost[0] = healthy[0, lane]
+        for s in range(len(faults)):
+            cost[labels[s]] = values[s, lane]
+        counts = sure_again(informed[lane], variances, waiting[lane], waiting[lane])
+        declared(cost, penalty, nothing, limit, after, k[lane], counts, state[lane], state[lane])

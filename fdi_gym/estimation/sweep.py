@@ -55,11 +55,10 @@ def sweep_of(model: AugmentedModel, rule: str, decision: Labelling | None) -> Sw
         return None
     bound, (Q, R), healthy = model.compiled, model.noises, contiguous(plant.healthy)
     head = (RULES[rule], *bound.constants, bound.limit, bound.linear, bound.H, bound.plain, contiguous(Q), contiguous(R))
-    metric = np.zeros((0, *decision.excess.shape)) if decision.metric is None else decision.metric
-    steps = np.array(sweep_kernels.addresses(), np.int64)
+    fixed, steps = decision.metric is not None, np.array(sweep_kernels.addresses(), np.int64)
     weighed = (
-        decision.excess, metric, decision.sets.labels, *decision.sets[1:], decision.penalty, decision.limit,
-        decision.lengths, healthy,
+        decision.metric[0] if fixed else decision.excess, fixed, decision.sets.labels, *decision.sets[1:], decision.penalty,
+        decision.limit, decision.lengths, healthy,
     )  # fmt: skip
 
     def sweep(
@@ -69,16 +68,12 @@ def sweep_of(model: AugmentedModel, rule: str, decision: Labelling | None) -> Sw
         """Over obs (n, K, n_obs) with the measured disturbances d (n, K, n_D), from sample k (n,) on; the state as `Swept`."""
         n, K, _ = obs.shape
         known = np.zeros((n, K, len(plant.disturbances))) if d is None else contiguous(d)
-        room = np.empty((2, *P.shape))
-        room[0] = P
-        after = [np.array(a, order="C") for a in (X, nu, S, count, declared, waiting)]
-        X, nu, S, count, declared, waiting = after
+        after = [np.array(a, order="C") for a in (X, P, nu, S, count, declared, waiting)]
         alarm, label, state = np.empty((n, K), bool), np.empty((n, K), np.int16), np.empty((n, K, len(plant.states)))
         estimate, std = np.empty((2, n, K, len(healthy)))
         sweep_kernels.sweep(
-            steps, *head, *weighed, contiguous(obs), known, k, X, room, nu, S, count, declared, waiting,
-            alarm, label, estimate, std, state,
+            steps, *head, *weighed, contiguous(obs), known, k, *after, alarm, label, estimate, std, state,
         )  # fmt: skip
-        return Swept(X, room[0], nu, S, count, declared, waiting, alarm, label, estimate, std, state)
+        return Swept(*after, alarm, label, estimate, std, state)
 
     return sweep

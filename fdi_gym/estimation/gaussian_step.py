@@ -1,0 +1,170 @@
+"""The Gaussian step of LANES episodes side by side: predict and update, of any plant, by any rule.
+
+X (N, LANES) and P (N N, LANES) and all that is so named are in lanes, as in `gaussian_algebra`. What a plant's equations are
+tried at is one episode's, and goes in and out of its lane; a linear plant and linear sensors stay in lanes throughout.
+"""
+
+from __future__ import annotations
+
+from numba import float64, int64, void
+
+from fdi_gym.estimation.gaussian_algebra import (
+    board_one,
+    correct,
+    entries_of,
+    entry,
+    factor,
+    predicted,
+    take_matrix,
+    take_vector,
+    through_matrix,
+    through_rows,
+)
+from fdi_gym.estimation.gaussian_moments import (
+    differenced,
+    differentiated,
+    heard,
+    linearised,
+    own_faults,
+    room_of,
+    sensed,
+    through,
+)
+from fdi_gym.estimation.gaussian_points import COMMANDS, EXTENDED, KNOWN, OUTPUTS, SENSORS, STATES, TANGENT
+from fdi_gym.integration import LANES
+from fdi_gym.kernels import M, V, compiled, floats, helper, inlined, ints
+from fdi_gym.tangent import row
+from fdi_gym.vectors import load, store, width, zeros
+
+I1, M3 = int64[::1], float64[:, :, ::1]
+# integers, reals, step, offset, direction: the constants of a model that tell its f and h, as `gaussian.bind` packs them
+MODEL = (I1, V, V, M, M3)
+
+
+@inlined
+def room_to_predict(rule, integers, reals, plant, N):
+    """What `move` works in."""
+    n_x, points = integers[STATES], plant.shape[0] == 0 and rule != EXTENDED
+    mean, cross, cov = floats((n_x, LANES)), floats((n_x * N, LANES)), floats((n_x * n_x, LANES))
+    F, where, many, Us = floats((n_x * N, LANES)), ints((n_x, N)), ints(n_x), floats((N * N if points else 0, LANES))
+    one = floats(N), floats(integers[COMMANDS]), floats(integers[KNOWN]), floats(n_x), floats((N, N) if points else (0, 0))
+    tables = floats((n_x, row(N))), floats((n_x, n_x)), room_of(integers, reals, row(N))
+    return mean, cross, cov, F, where, many, Us, one, tables
+
+
+@helper
+def move(rule, integers, reals, step, offset, direction, limit, plant, first, X, P, t, u, known, Q, room):
+    """X and P one sample after t (LANES,); the first lane's is episode number `first`."""
+    mean, cross, cov, F, where, many, Us, (x, ue, de, moved, U), (table, across, inner) = room
+    n_x, N = mean.shape[0], X.shape[0]
+    linear, points = plant.shape[0] > 0, plant.shape[0] == 0 and rule != EXTENDED
+    if linear:
+        linearised(integers, offset, direction, plant, first, X, u, known, F, mean)
+    elif points:
+        factor(P, N, Us)
+    for lane in range(0 if linear else LANES):
+        line = (first + lane) % offset.shape[0]
+        take_vector(X, lane, x)
+        take_vector(u, lane, ue)
+        take_vector(known, lane, de)
+        if points:
+            take_matrix(Us, lane, U)
+            through(
+                rule, True, integers, reals, offset[line], direction[line], t[lane], x, U, ue, de, moved, table, across
+            )
+            board_one(table, lane, N, cross)
+            board_one(across, lane, n_x, cov)
+        else:
+            if integers[TANGENT] != 0:
+                differentiated(
+                    integers, reals, step, offset[line], direction[line], t[lane], x, ue, de, inner, table, moved
+                )
+            else:
+                differenced(integers, reals, step, offset[line], direction[line], t[lane], x, ue, de, table, moved)
+            board_one(table, lane, N, F)
+        for i in range(n_x):
+            mean[i, lane] = moved[i]
+    if not points:
+        entries_of(F, n_x, N, where, many)
+        through_matrix(F, P, n_x, N, where, many, cross, cov)
+    predicted(first, mean, cross, cov, Q, limit, X, P)
+
+
+@inlined
+def room_to_hear(rule, integers, reals, H, N):
+    """What `hear` works in."""
+    m, points = integers[SENSORS], H.shape[0] == 0 and rule != EXTENDED
+    mean, cross, F, S = floats((m, LANES)), floats((m * N, LANES)), floats((m * N, LANES)), floats((m * m, LANES))
+    white, where, many, Us = floats((m, LANES)), ints((m, N)), ints(m), floats((N * N if points else 0, LANES))
+    one = floats(N), floats(integers[COMMANDS]), floats(integers[KNOWN]), floats(m), floats((N, N) if points else (0, 0))
+    tables = floats((m, width(N))), floats((m, m)), room_of(integers, reals, width(N))
+    return mean, cross, F, S, white, where, many, Us, one, tables, own_faults(integers), floats(N), floats(integers[OUTPUTS])
+
+
+@helper
+def hear(
+    rule, integers, reals, step, offset, direction, H, plain, first, X, P, t, u, known, y, seen, R, room, nu, S, U
+):  # fmt: skip
+    """X and P after the sensors y (m) at t (LANES,) that reported (seen > 0): nu' S^-1 nu; S = U' U."""
+    mean, cross, F, cov, white, where, many, Us, (xe, ue, de, read, Ue), (table, across, inner), faults, x, values = room
+    m, N = mean.shape[0], X.shape[0]
+    fixed, points = H.shape[0] > 0, H.shape[0] == 0 and rule != EXTENDED
+    if fixed:
+        for a in range(m):
+            total = zeros()
+            for j in range(N):
+                if H[a, j] != 0.0:
+                    total += load(X, j, 0) * H[a, j]
+            store(mean, a, 0, total)
+        through_rows(H, P, cross, cov)
+    elif points:
+        factor(P, N, Us)
+    for lane in range(0 if fixed else LANES):
+        line = (first + lane) % offset.shape[0]
+        take_vector(X, lane, xe)
+        take_vector(u, lane, ue)
+        take_vector(known, lane, de)
+        if points:
+            take_matrix(Us, lane, Ue)
+            through(
+                rule, False, integers, reals, offset[line], direction[line], t[lane], xe, Ue, ue, de, read, table, across
+            )
+            board_one(table, lane, N, cross)
+            board_one(across, lane, m, cov)
+        else:
+            if plain.shape[0] > 0:
+                heard(integers, reals, faults, offset[line], direction[line], plain, xe, table, read)
+            else:
+                sensed(
+                    integers, reals, step, offset[line], direction[line], t[lane], xe, ue, de, inner, x, values, table, read
+                )
+            board_one(table, lane, N, F)
+        for a in range(m):
+            mean[a, lane] = read[a]
+    if not (fixed or points):
+        entries_of(F, m, N, where, many)
+        through_matrix(F, P, m, N, where, many, cross, cov)
+    for a in range(m):
+        for b in range(a + 1):
+            total = load(cov, a * m + b, 0)
+            store(cov, a * m + b, 0, total + entry(R, first, a, b))
+            store(cov, b * m + a, 0, total + entry(R, first, b, a))
+    return correct(X, P, y, seen, mean, cov, cross, U, white, nu, S)
+
+
+@compiled(void(int64, *MODEL, V, M, int64, M, M, V, M, M, M3))
+def predict_lanes(rule, integers, reals, step, offset, direction, limit, plant, first, X, P, t, u, known, Q):
+    """`move`, for whoever has its episodes in lanes."""
+    room = room_to_predict(rule, integers, reals, plant, X.shape[0])
+    move(rule, integers, reals, step, offset, direction, limit, plant, first, X, P, t, u, known, Q, room)
+
+
+@compiled(void(int64, *MODEL, M, M, int64, M, M, V, M, M, M, M, M3, M, M))
+def update_lanes(
+    rule, integers, reals, step, offset, direction, H, plain, first, X, P, t, u, known, y, seen, R, nu, S
+):  # fmt: skip
+    """`hear`, for whoever has its episodes in lanes."""
+    room, U = room_to_hear(rule, integers, reals, H, X.shape[0]), floats(S.shape)
+    hear(
+        rule, integers, reals, step, offset, direction, H, plain, first, X, P, t, u, known, y, seen, R, room, nu, S, U
+    )  # fmt: skip
