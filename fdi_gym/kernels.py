@@ -62,6 +62,7 @@ _ROLES = {
 }
 
 
+LINE = 64  # bytes, of the cache: no vector on the stack lies in two
 _carray: Any = numba.carray  # type: ignore[attr-defined]  # the array at a pointer
 njit: Any = numba.njit
 # What only generic kernels call: no way in from Python or C, slow to compile, and, as these themselves, no array of its own
@@ -162,7 +163,7 @@ def stack(*shape: int) -> Any:
     def _room_at(typing_context):
         def codegen(context, builder, signature, arguments):
             room = cgutils.alloca_once(builder, ir.ArrayType(ir.DoubleType(), size))
-            room.align = 64  # that no vector lies in two lines of the cache
+            room.align = LINE
             return builder.bitcast(room, context.get_value_type(signature.return_type))
 
         return types.CPointer(float64)(), codegen
@@ -196,7 +197,11 @@ def _array(dtype: Any, given: bool) -> Any:
             strides.insert(0, builder.mul(strides[0], extent))
         for extent in shape[1:]:
             count = builder.mul(count, extent)
-        data = builder.alloca(item, count) if address is None else builder.inttoptr(address, item.as_pointer())
+        if address is None:
+            data = builder.alloca(item, count)
+            data.align = LINE
+        else:
+            data = builder.inttoptr(address, item.as_pointer())
         array = context.make_array(kind)(context, builder)
         populate_array(array, data=data, shape=shape, strides=strides, itemsize=size, meminfo=None)
         return array._getvalue()

@@ -113,4 +113,5 @@ def augmented_ekf(
     """
     model = augmented(plant, belief, walk=walk, x0_std=x0_std, z0_std=z0_std, z_walk=z_walk)
     rules = by_labels(plant, calibration, decision, size=belief.z_size)
-    return diagnoser_of(plant, gaussian_filter(model, rule, first_sample), rules, sweep_of(model, rule, rules.labelling))
+    sweep = sweep_of(plant, model.compiled, rule, model.Q, model.R, rules.labelling)
+    return diagnoser_of(plant, gaussian_filter(model, rule, first_sample), rules, sweep)

@@ -12,12 +12,13 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from baselines.filters.two_stage_kf import aging, decision_rule, initial_covariances
+from baselines.filters.two_stage_kf import age, aging, decision_rule, initial_covariances
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.estimation import gaussian
 from fdi_gym.estimation.decision import Reading
 from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.linear import linear_model
+from fdi_gym.estimation.sweep import sweep_of
 from fdi_gym.plant import Array, Plant
 
 
@@ -31,16 +32,31 @@ class AugmentedState(NamedTuple):
     seen: Array  # (n,) sensors in it
 
 
-def augmented_filter(plant: Plant, aged: Callable[[Array], Array]) -> Filter:
-    """The Kalman filter of F = [A E_k; 0 I], with the time update `aged` of the fault parameter's covariance."""
-    linear = linear_model(plant)
-    P_x, P_z = initial_covariances(plant)
-    n_x, n_y, p = len(P_x), len(plant.outputs), len(P_z)
-    N, scale = n_x + p, [s.scale for s in (*plant.states, *plant.theta)]
+class Augmented(NamedTuple):
+    """The model of F = [A E_k; 0 I], and what a sample adds to the covariance."""
+
+    model: gaussian.Model
+    Q: Array  # (N, N)
+
+
+def augmented_model(plant: Plant) -> Augmented:
+    """Of a linear plant, with the fault parameter as it is.
+
+    Raises:
+        NotApplicableError: The plant is nonlinear.
+    """
+    linear, n_y, p = linear_model(plant), len(plant.outputs), len(plant.theta)
+    scale = [s.scale for s in (*plant.states, *plant.theta)]
     model = gaussian.bind(plant, scale=scale, entries=range(p), H=np.hstack([linear.C, np.zeros((n_y, p))]))
+    return Augmented(model, np.asarray(scipy.linalg.block_diag(plant.Q, np.zeros((p, p)))))
+
+
+def augmented_filter(plant: Plant, known: Augmented, aged: Callable[[Array], Array]) -> Filter:
+    """The Kalman filter, with the time update `aged` of the fault parameter's covariance."""
+    P_x, P_z = initial_covariances(plant)
+    n_x, n_y, N, model = len(P_x), len(plant.outputs), len(P_x) + len(P_z), known.model
     P0 = np.asarray(scipy.linalg.block_diag(P_x, P_z))
-    Q = np.asarray(scipy.linalg.block_diag(plant.Q, np.zeros((p, p))))[None]
-    R, t = plant.R[None], np.zeros(1)  # a linear plant knows no time
+    Q, R, t = known.Q[None], plant.R[None], np.zeros(1)  # a linear plant knows no time
 
     def start(n: int) -> AugmentedState:
         S = np.tile(np.eye(n_y), (n, 1, 1))
@@ -79,5 +95,8 @@ def augmented_kf(
     position: Mapping[str, float] | None = None,
 ) -> Diagnoser:
     """The augmented Kalman filter; arguments and errors as of `two_stage_kf`."""
-    filter = augmented_filter(plant, aging(q_bias, forgetting, factor, a_min, a_max))
-    return diagnoser_of(plant, filter, decision_rule(plant, decision, threshold, release_after, position))
+    known, ages = augmented_model(plant), (q_bias, forgetting, factor, a_min, a_max)
+    filter = augmented_filter(plant, known, aging(*ages))
+    rule = decision_rule(plant, decision, threshold, release_after, position)
+    sweep = sweep_of(plant, known.model, "extended", known.Q, plant.R, rule.labelling, age(*ages))
+    return diagnoser_of(plant, filter, rule, sweep)

@@ -7,7 +7,9 @@ import numpy as np
 from numba import boolean, float64, int64, void
 
 from fdi_gym.estimation.compiled import eliminate
-from fdi_gym.kernels import M, compiled, floats, helper
+from fdi_gym.estimation.sweep_kernels import AGE
+from fdi_gym.integration import LANES
+from fdi_gym.kernels import M, compiled, floats, helper, inlined
 
 M3, B2, I1 = float64[:, :, ::1], boolean[:, ::1], int64[::1]
 DIRECTIONAL, EXPONENTIAL = 1, 2
@@ -75,39 +77,61 @@ def symmetrise(P):
             P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
 
 
+@inlined
+def forget_one(Pz, rule, factor, a_min, a_max, q, aged):
+    """Pz (p, p) under forgetting, eigenvalue by eigenvalue (`two_stage_kf.forget`), and q more on its diagonal."""
+    p, squares = Pz.shape[0], 0.0
+    limit = a_max if rule == DIRECTIONAL else factor * a_max if rule == EXPONENTIAL else np.inf
+    for i in range(p):
+        for j in range(p):
+            squares += Pz[i, j] * Pz[i, j]
+            if rule == DIRECTIONAL:
+                aged[i, j] = (a_min if i == j else 0.0) + Pz[i, j] * ((a_max - a_min) / a_max)
+            elif rule == EXPONENTIAL:
+                aged[i, j] = Pz[i, j] / factor
+            else:
+                aged[i, j] = Pz[i, j]
+    if squares > limit * limit:
+        P = Pz.copy()
+        symmetrise(P)
+        a, v = np.linalg.eigh(P)
+        for k in range(p):
+            if rule == EXPONENTIAL:
+                a[k] = max(a[k], min(a[k] / factor, a_max))
+            elif a[k] <= a_max:
+                a[k] = a_min + a[k] * (a_max - a_min) / a_max
+        for i in range(p):
+            for j in range(p):
+                aged[i, j] = 0.0
+                for k in range(p):
+                    aged[i, j] += v[i, k] * a[k] * v[j, k]
+    for i in range(p):
+        for j in range(p):
+            aged[i, j] += q if i == j else 0.0
+
+
 @compiled(void(M3, int64, float64, float64, float64, float64, M3), heap=True)
 def forget(Pz, rule, factor, a_min, a_max, q, aged):
-    """Pz (n, p, p) under forgetting, eigenvalue by eigenvalue (`two_stage_kf.forget`), and q more on its diagonal."""
-    n, p, _ = Pz.shape
-    limit = a_max if rule == DIRECTIONAL else factor * a_max if rule == EXPONENTIAL else np.inf
-    for e in range(n):
-        squares = 0.0
+    """`forget_one` for Pz (n, p, p)."""
+    for e in range(len(Pz)):
+        forget_one(Pz[e], rule, factor, a_min, a_max, q, aged[e])
+
+
+@compiled(AGE, heap=True)
+def forget_lanes(constants, n_x, P):
+    """`forget_one` for the last entries of covariances P (N N) in lanes; constants: rule, factor, a_min, a_max and q."""
+    N = round(np.sqrt(P.shape[0]))
+    p = N - n_x
+    before, aged = floats((p, p)), floats((p, p))
+    rule, factor, a_min, a_max, q = int(constants[0]), constants[1], constants[2], constants[3], constants[4]
+    for lane in range(LANES):
         for i in range(p):
             for j in range(p):
-                squares += Pz[e, i, j] * Pz[e, i, j]
-                if rule == DIRECTIONAL:
-                    aged[e, i, j] = (a_min if i == j else 0.0) + Pz[e, i, j] * ((a_max - a_min) / a_max)
-                elif rule == EXPONENTIAL:
-                    aged[e, i, j] = Pz[e, i, j] / factor
-                else:
-                    aged[e, i, j] = Pz[e, i, j]
-        if squares > limit * limit:
-            P = Pz[e].copy()
-            symmetrise(P)
-            a, v = np.linalg.eigh(P)
-            for k in range(p):
-                if rule == EXPONENTIAL:
-                    a[k] = max(a[k], min(a[k] / factor, a_max))
-                elif a[k] <= a_max:
-                    a[k] = a_min + a[k] * (a_max - a_min) / a_max
-            for i in range(p):
-                for j in range(p):
-                    aged[e, i, j] = 0.0
-                    for k in range(p):
-                        aged[e, i, j] += v[i, k] * a[k] * v[j, k]
+                before[i, j] = P[(n_x + i) * N + n_x + j, lane]
+        forget_one(before, rule, factor, a_min, a_max, q, aged)
         for i in range(p):
             for j in range(p):
-                aged[e, i, j] += q if i == j else 0.0
+                P[(n_x + i) * N + n_x + j, lane] += aged[i, j] - before[i, j]
 
 
 @compiled(void(M, M3, M, M3, M3, M3, boolean, M, M, M, M, M3, M3, M, M3, M3))

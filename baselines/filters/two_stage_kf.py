@@ -22,6 +22,7 @@ from fdi_gym.diagnosis import Diagnoser, Filter, NotApplicableError, diagnoser, 
 from fdi_gym.estimation.calibration import Persistence, uniform
 from fdi_gym.estimation.decision import Reading, Rule, by_candidate, by_labels
 from fdi_gym.estimation.linear import LinearModel, linear_model, stacked
+from fdi_gym.estimation.sweep import Age
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, Plant
 
@@ -81,6 +82,12 @@ def aging(q_bias: float, forgetting: str, factor: float, a_min: float, a_max: fl
     if forgetting not in FORGETTING:
         raise ValueError(f"unknown forgetting {forgetting!r}; there are {', '.join(FORGETTING)}")
     return lambda Pz: forget(Pz, forgetting, factor, a_min, a_max, q_bias)
+
+
+def age(q_bias: float, forgetting: str, factor: float, a_min: float, a_max: float) -> Age | None:
+    """The same as a step of a sweep; None where nothing ages."""
+    constants = np.array([FORGETTING.index(forgetting), factor, a_min, a_max, q_bias])
+    return Age(kernels.forget_lanes, constants) if forgetting != "none" or q_bias else None
 
 
 def predict(s: TwoStage, u: Array, model: LinearModel, Q: Array, Pz_minus: Array) -> TwoStage:

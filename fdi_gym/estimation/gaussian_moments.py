@@ -281,7 +281,7 @@ def room_of(integers, reals, W):
     """Room for theta and p, in one and apart, d, and deviations of all of them (-1, W) with which of those count."""
     n_theta, own, n_D = integers[THETA], integers[OWN], integers[KNOWN]
     now, d, used = floats(reals.size - 1), floats(n_D), ints(integers[ENTRIES] + integers[DISTURBANCES])
-    L = floats((own + n_D + now.size - n_theta, W))
+    L = floats((own + n_D + now.size - n_theta if W else 0, W))
     put(reals[1:], now)
     L[:] = 0.0
     return now, now[:own], now[n_theta:], d, L, used

@@ -34,7 +34,7 @@ from fdi_gym.estimation.gaussian_points import COMMANDS, EXTENDED, KNOWN, OUTPUT
 from fdi_gym.integration import LANES
 from fdi_gym.kernels import M, V, compiled, floats, helper, inlined, ints
 from fdi_gym.tangent import row
-from fdi_gym.vectors import load, store, width, zeros
+from fdi_gym.vectors import load, store, zeros
 
 I1, M3 = int64[::1], float64[:, :, ::1]
 # integers, reals, step, offset, direction: the constants of a model that tell its f and h, as `gaussian.bind` packs them
@@ -48,7 +48,7 @@ def room_to_predict(rule, integers, reals, plant, N):
     mean, cross, cov = floats((n_x, LANES)), floats((n_x * N, LANES)), floats((n_x * n_x, LANES))
     F, where, many, Us = floats((n_x * N, LANES)), ints((n_x, N)), ints(n_x), floats((N * N if points else 0, LANES))
     one = floats(N), floats(integers[COMMANDS]), floats(integers[KNOWN]), floats(n_x), floats((N, N) if points else (0, 0))
-    tables = floats((n_x, row(N))), floats((n_x, n_x)), room_of(integers, reals, row(N))
+    tables = floats((n_x, row(N))), floats((n_x, n_x)), room_of(integers, reals, 0 if plant.shape[0] > 0 else row(N))
     return mean, cross, cov, F, where, many, Us, one, tables
 
 
@@ -97,7 +97,7 @@ def room_to_hear(rule, integers, reals, H, N):
     mean, cross, F, S = floats((m, LANES)), floats((m * N, LANES)), floats((m * N, LANES)), floats((m * m, LANES))
     white, where, many, Us = floats((m, LANES)), ints((m, N)), ints(m), floats((N * N if points else 0, LANES))
     one = floats(N), floats(integers[COMMANDS]), floats(integers[KNOWN]), floats(m), floats((N, N) if points else (0, 0))
-    tables = floats((m, width(N))), floats((m, m)), room_of(integers, reals, width(N))
+    tables = floats((m, N)), floats((m, m)), room_of(integers, reals, 0)
     return mean, cross, F, S, white, where, many, Us, one, tables, own_faults(integers), floats(N), floats(integers[OUTPUTS])
 
 

@@ -7,17 +7,17 @@ which costs a filter of a few states more than its equations do.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fdi_gym.estimation import sweep_kernels
-from fdi_gym.estimation.augmented import AugmentedModel
 from fdi_gym.estimation.decision import Labelling
 from fdi_gym.estimation.equivalent import has_equivalents
-from fdi_gym.estimation.gaussian import RULES
+from fdi_gym.estimation.gaussian import RULES, Model
+from fdi_gym.kernels import address
 from fdi_gym.model import contiguous
-from fdi_gym.plant import Array
+from fdi_gym.plant import Array, Plant
 
 
 class Swept(NamedTuple):
@@ -37,25 +37,38 @@ class Swept(NamedTuple):
     state: Array  # (n, K, n_x)
 
 
+class Age(NamedTuple):
+    """A kernel of the signature `sweep_kernels.AGE`, and its constants: what becomes of a prediction's covariance."""
+
+    kernel: Any
+    constants: Array
+
+
 Sweep = Callable[..., Swept]
 
 
-def sweep_of(model: AugmentedModel, rule: str, decision: Labelling | None) -> Sweep | None:
+def sweep_of(
+    plant: Plant, model: Model, rule: str, Q: Array, R: Array, decision: Labelling | None, age: Age | None = None
+) -> Sweep | None:
     """The sweep of an augmented filter whose decision is `by_labels`; None where it must go sample by sample.
 
     That is where a statistic raises the alarm, or where measurements have equivalents to choose from.
 
     Args:
-        model: The model, of one line.
+        plant: The plant.
+        model: Its augmented model, whose magnitudes are those of `plant.estimated`.
         rule: One of `gaussian.RULES`.
+        Q: Covariance (N, N) that a sample adds.
+        R: Covariance (m, m) of the sensors' noise.
         decision: What the decision weighs with.
+        age: What else becomes of a prediction's covariance.
     """
-    plant = model.plant
-    if decision is None or has_equivalents(plant) or model.lines is not None:
+    if decision is None or has_equivalents(plant):
         return None
-    bound, (Q, R), healthy = model.compiled, model.noises, contiguous(plant.healthy)
-    head = (RULES[rule], *bound.constants, bound.limit, bound.linear, bound.H, bound.plain, contiguous(Q), contiguous(R))
-    fixed, steps = decision.metric is not None, np.array(sweep_kernels.addresses(), np.int64)
+    healthy = contiguous(plant.healthy)
+    head = (RULES[rule], *model.constants, model.limit, model.linear, model.H, model.plain, contiguous(Q[None]), contiguous(R[None]))
+    age = Age(sweep_kernels.no_age, np.zeros(0)) if age is None else age
+    fixed, steps = decision.metric is not None, np.array([address(k) for k in (*sweep_kernels.STEPS, age.kernel)])
     weighed = (
         decision.metric[0] if fixed else decision.excess, fixed, decision.sets.labels, *decision.sets[1:], decision.penalty,
         decision.limit, decision.lengths, healthy,
@@ -72,7 +85,7 @@ def sweep_of(model: AugmentedModel, rule: str, decision: Labelling | None) -> Sw
         alarm, label, state = np.empty((n, K), bool), np.empty((n, K), np.int16), np.empty((n, K, len(plant.states)))
         estimate, std = np.empty((2, n, K, len(healthy)))
         sweep_kernels.sweep(
-            steps, *head, *weighed, contiguous(obs), known, k, *after, alarm, label, estimate, std, state,
+            steps, age.constants, *head, *weighed, contiguous(obs), known, k, *after, alarm, label, estimate, std, state,
         )  # fmt: skip
         return Swept(*after, alarm, label, estimate, std, state)
 

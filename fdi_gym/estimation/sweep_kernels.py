@@ -10,17 +10,20 @@ from fdi_gym.estimation.gaussian_points import COMMANDS, DISTURBANCES, ENTRIES, 
 from fdi_gym.estimation.gaussian_step import MODEL, predict_lanes, update_lanes
 from fdi_gym.estimation.label_kernels import SETS, decide_lanes
 from fdi_gym.integration import LANES
-from fdi_gym.kernels import M, V, address, bools, compiled, floats, function_at, helper, ints, signature_of
+from fdi_gym.kernels import M, V, bools, compiled, floats, function_at, helper, ints, signature_of
 from fdi_gym.vectors import load, store
 
 I1, I2, M3 = int64[::1], int64[:, ::1], float64[:, :, ::1]
+AGE = void(V, int64, M)
+
+
+@compiled(AGE)
+def no_age(constants, n_x, P):
+    """Nothing becomes of a prediction's covariance P (N N) in lanes; x are its first n_x entries."""
+
+
 STEPS = predict_lanes, update_lanes, decide_lanes
-predict_at, update_at, decide_at = (function_at(signature_of(kernel)) for kernel in STEPS)
-
-
-def addresses() -> tuple[int, ...]:
-    """Of the compiled steps that a sweep takes in turn."""
-    return tuple(address(kernel) for kernel in STEPS)
+predict_at, update_at, decide_at, age_at = (function_at(s) for s in (*(signature_of(kernel) for kernel in STEPS), AGE))
 
 
 @helper
@@ -53,23 +56,25 @@ def tell(x, z, P, healthy, lane, estimate, std, state):
 
 @compiled(
     void(
-        I1, int64, *MODEL, V, M, M, M, M3, M3, M, boolean, I1, *SETS, V, float64, I1, V, M3, M3, I1, M, M3, M, M3, I1, I2, M,
+        I1, V, int64, *MODEL, V, M, M, M, M3, M3, M, boolean, I1, *SETS, V, float64, I1, V, M3, M3, I1, M, M3, M, M3, I1, I2, M,
         boolean[:, ::1], int16[:, ::1], M3, M3, M3,
     )
 )  # fmt: skip
 def sweep(
-    steps, rule, integers, reals, step, offset, direction, limit, plant, H, plain, Q, R,
+    steps, ages, rule, integers, reals, step, offset, direction, limit, plant, H, plain, Q, R,
     excess, fixed, labels, faults, at, along, low, high, penalty, rise, after, healthy,
     obs, d, following, X, P, nu, S, count, declared, waiting, alarm, label, estimate, std, state,
 ):  # fmt: skip
     """Samples `following` (n,) and on, obs (n, K, n_obs), of which all commands and known signals reported.
 
     X, P, nu, S, count, declared and waiting are brought up to the last of them. What is said of each sample comes last.
+    steps: the addresses of STEPS and of what becomes of a prediction's covariance, `no_age` or one like it with `ages`.
     """
     (n, N), K, n_x, m, p = X.shape, obs.shape[1], integers[STATES], integers[SENSORS], healthy.size
     predict = predict_at(steps[0])
     update = update_at(steps[1])
     decide = decide_at(steps[2])
+    age = age_at(steps[3])
     Xs, Ps, ts, us, ds = (
         floats((N, LANES)), floats((N * N, LANES)), floats(LANES), floats((integers[COMMANDS], LANES)),
         floats((integers[KNOWN], LANES)),
@@ -94,6 +99,7 @@ def sweep(
                 ts[lane] = ks[lane] * reals[0]
                 ks[lane] += 1
             predict(rule, integers, reals, step, offset, direction, limit, plant, first, Xs, Ps, ts, us, ds, Q)
+            age(ages, n_x, Ps)
             for lane in range(LANES):
                 ts[lane] = ks[lane] * reals[0]
                 informed[lane] = False
