@@ -36,7 +36,7 @@ def _around(sizes: tuple[int, ...], dynamics: Any, jacobian: Any, *manifold: Any
     of_state, table = stack(n), stack(n, W)  # known sizes: LLVM unrolls the loops
     by_x, by_theta, by_d, by_p = stack(n, n), stack(n, n_theta), stack(n, n_d), stack(n, n_p)
     count = min(W, WIDEST)
-    zeros, load, store, plus = vectors(count)[:4]
+    zeros, load, store = vectors(count)
 
     def tangent(t, dt, substeps, x, u, theta, d, p, L, used, step, V):
         h, stages = dt / max(substeps, 1), 4 if substeps else 1
@@ -57,7 +57,7 @@ def _around(sizes: tuple[int, ...], dynamics: Any, jacobian: Any, *manifold: Any
                     for a in range(n):
                         z[a] = now[a] + ahead * k[a]
                         for c in range(0, W, count):
-                            store(Z, a, c, plus(load(V, a, c), ahead, load(K, a, c)))
+                            store(Z, a, c, load(V, a, c) + load(K, a, c) * ahead)
                 J_x[:], J_theta[:], J_d[:], J_p[:] = 0.0, 0.0, 0.0, 0.0
                 dynamics(t + s * h + ahead, z, u, theta, d, p, k)
                 jacobian(t + s * h + ahead, z, u, theta, d, p, J_x, J_theta, J_d, J_p)
@@ -70,7 +70,7 @@ def _around(sizes: tuple[int, ...], dynamics: Any, jacobian: Any, *manifold: Any
                         rate = zeros()
                         for b in range(n):
                             if J_x[a, b] != 0.0:
-                                rate = plus(rate, J_x[a, b], load(Z, b, c))
+                                rate += load(Z, b, c) * J_x[a, b]
                         store(K, a, c, rate)
                 for i in used:
                     for a in range(n):
@@ -82,15 +82,15 @@ def _around(sizes: tuple[int, ...], dynamics: Any, jacobian: Any, *manifold: Any
                             gain = J_p[a, i - n_theta - n_d]
                         if gain != 0.0:
                             for c in range(0, W, count):
-                                store(K, a, c, plus(load(K, a, c), gain, load(L, i, c)))
+                                store(K, a, c, load(K, a, c) + load(L, i, c) * gain)
                 weight = 2.0 if 0 < stage < 3 else 1.0
                 for a in range(n):
                     for c in range(0, W, count):
-                        store(total, a, c, plus(load(total, a, c), weight, load(K, a, c)))
+                        store(total, a, c, load(total, a, c) + load(K, a, c) * weight)
             for a in range(n):
                 now[a] = now[a] + h / 6.0 * (first[a] + 2.0 * middle[a] + k[a]) if substeps else k[a]
                 for c in range(0, W, count):
-                    store(V, a, c, plus(load(V, a, c), h / 6.0, load(total, a, c)) if substeps else load(total, a, c))
+                    store(V, a, c, load(V, a, c) + load(total, a, c) * (h / 6.0) if substeps else load(total, a, c))
         if curved:
             for j in range(W):  # the projection, by differences along each column
                 small = FINE * (step[j] if j < step.size else 1.0)

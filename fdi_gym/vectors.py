@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from llvmlite import ir
-from numba import boolean, float64, intp
+from numba import boolean, intp
 from numba.core import cgutils, types
 from numba.extending import intrinsic, models, overload, register_model
 
@@ -41,14 +41,11 @@ class _Model(models.PrimitiveModel):
 
 
 class Vectors(NamedTuple):
-    """What kernels may do with vectors of so many numbers; each is rounded as the scalar's would be."""
+    """Vectors of so many numbers, in memory and out of it."""
 
     zeros: Any  # zeros(): a vector of zeros
     load: Any  # load(A, i, j): A[i, j : j + count]
     store: Any  # store(A, i, j, v): A[i, j : j + count] = v
-    plus: Any  # plus(v, a, w): v + a w
-    minus: Any  # minus(v, a, w): v - a w
-    over: Any  # over(v, a): v / a
 
 
 @functools.cache
@@ -60,10 +57,6 @@ def vectors(count: int) -> Vectors:
     def at(context, builder, kind, array, i, j):
         room = context.make_array(kind)(context, builder, array)
         return builder.bitcast(cgutils.get_item_pointer(context, builder, kind, room, [i, j]), shape.as_pointer())
-
-    def splat(builder, scalar):
-        one = builder.insert_element(ir.Constant(shape, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
-        return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(ir.IntType(32), count), None))
 
     def _zeros(typing_context):
         return lanes(), lambda context, builder, signature, given: ir.Constant(shape, None)
@@ -81,28 +74,10 @@ def vectors(count: int) -> Vectors:
 
         return types.void(A, intp, intp, lanes), codegen
 
-    def _plus(typing_context, v, a, w):
-        def codegen(context, builder, signature, given):
-            return builder.fadd(given[0], builder.fmul(splat(builder, given[1]), given[2]))
-
-        return lanes(lanes, float64, lanes), codegen
-
-    def _minus(typing_context, v, a, w):
-        def codegen(context, builder, signature, given):
-            return builder.fsub(given[0], builder.fmul(splat(builder, given[1]), given[2]))
-
-        return lanes(lanes, float64, lanes), codegen
-
-    def _over(typing_context, v, a):
-        def codegen(context, builder, signature, given):
-            return builder.fdiv(given[0], splat(builder, given[1]))
-
-        return lanes(lanes, float64), codegen
-
-    return Vectors(*(intrinsic(make) for make in (_zeros, _load, _store, _plus, _minus, _over)))
+    return Vectors(*(intrinsic(make) for make in (_zeros, _load, _store)))
 
 
-zeros, load, store, plus, minus, over = vectors(LANES)
+zeros, load, store = vectors(LANES)
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -149,9 +124,7 @@ _ADD = _operation(lambda builder, v, w: builder.fadd(v, w))
 _SUBTRACT = _operation(lambda builder, v, w: builder.fsub(v, w))
 _MULTIPLY = _operation(lambda builder, v, w: builder.fmul(v, w))
 _DIVIDE = _operation(lambda builder, v, w: builder.fdiv(v, w))
-_CHOOSE = _operation(
-    lambda builder, c, v, w: builder.select(builder.fcmp_ordered(">", c, ir.Constant(c.type, None)), v, w)
-)
+_CHOOSE = _operation(lambda builder, c, v, w: builder.select(builder.fcmp_ordered(">", c, ir.Constant(c.type, None)), v, w))
 
 
 def _overloaded(symbol: Any, operation: Any) -> None:
@@ -175,15 +148,11 @@ def choose(c, v, w):
     return _CHOOSE((c, v, w))
 
 
-@intrinsic
-def root(typing_context, v):
-    """The square roots."""
-
+def _root(typing_context, v):
     def codegen(context, builder, signature, given):
         (vector,) = given
-        name = f"llvm.sqrt.v{v.count}f64"
-        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(vector.type, [vector.type]), name)
-        return builder.call(function, [vector])
+        kind = ir.FunctionType(vector.type, [vector.type])
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{v.count}f64"), [vector])
 
     return (v(v), codegen) if isinstance(v, Lanes) else None
 
@@ -202,5 +171,6 @@ def _any_lane(comparison: str, ordered: bool) -> Any:
     return intrinsic(made)
 
 
+root: Any = intrinsic(_root)  # root(v): the square roots
 above = _any_lane(">", ordered=True)  # above(v): any lane is above 0
 filled = _any_lane("!=", ordered=False)  # filled(v): any lane is not 0

@@ -120,7 +120,10 @@ def test_two_stage_equals_augmented(rule):
     """The two-stage filter is the augmented one, whatever happens to the fault parameter's covariance."""
     plant, obs = long_flight()
     aged = two_stage_kf.aging(*RULES[rule], 0.99, 1e-4, 1.0)
-    two, one = two_stage_kf.two_stage_filter(plant, aged), augmented_kf.augmented_filter(plant, augmented_kf.augmented_model(plant), aged)
+    two, one = (
+        two_stage_kf.two_stage_filter(plant, aged),
+        augmented_kf.augmented_filter(plant, augmented_kf.augmented_model(plant), aged),
+    )
     assert farthest(plant, two, one, obs, "z", "P", "x", "Px", "nu", "S") < 1e-9
 
 
@@ -160,7 +163,9 @@ def test_missing_sensors_are_rows_removed(rule):
 def test_friedland_equals_augmented_only_for_a_constant_bias(q_bias, equal):
     plant, obs = long_flight()
     bare = friedland_kf.friedland_kf(plant, q_bias=q_bias).filter
-    one = augmented_kf.augmented_filter(plant, augmented_kf.augmented_model(plant), two_stage_kf.aging(q_bias, "none", 0.99, 1e-4, 1.0))
+    one = augmented_kf.augmented_filter(
+        plant, augmented_kf.augmented_model(plant), two_stage_kf.aging(q_bias, "none", 0.99, 1e-4, 1.0)
+    )
     worst = farthest(plant, bare, one, obs, "z")
     assert worst < 1e-9 if equal else worst > 1e-3
 

@@ -100,7 +100,9 @@ def test_general_filter_is_the_augmented_kf_with_its_tuning(b747, rule):
     model = model_of(b747, **tuning)
     model = model.replace(limit=np.full(8, np.inf))
     obs = flown(b747)[1].obs[:, :200]
-    special = augmented_kf.augmented_filter(b747, augmented_kf.augmented_model(b747), two_stage_kf.aging(1e-4, "none", 0.99, 1e-4, 1.0))
+    special = augmented_kf.augmented_filter(
+        b747, augmented_kf.augmented_model(b747), two_stage_kf.aging(1e-4, "none", 0.99, 1e-4, 1.0)
+    )
     said = run(make_diagnoser("augmented_kf", b747, q_bias=1e-4, forgetting="none"), obs)
     for k, (s, own) in enumerate(zip(followed(model, rule, obs, False), states(b747, special, obs), strict=True)):
         if k:

@@ -48,7 +48,7 @@ class Diagnoser(NamedTuple):
     filter: Any = None  # the `filtering.Filter` that it is made of, where it is
     rule: Any = None  # and the `estimation.decision.Rule`
     guarded: bool = False  # whether it is under the guard already
-    # update over several samples (n, K, n_obs) at once: what it says has them along the second axis; None: one by one, please
+    # as update, over samples (n, K, n_obs) at once, which come second in what it says; None where it needs them one by one
     sweep: Callable[[Any, Array], tuple[Any, Diagnosis] | None] | None = None
 
 
@@ -124,13 +124,14 @@ def run(diagnoser: Diagnoser, obs: Array, signals: bool = False) -> Decisions:
         signals: Record the method's own signals too.
     """
     n, samples, _ = obs.shape
-    state, recording, k = diagnoser.init(n), Recording(n, samples, signals), 0
-    while k < samples:
-        several = diagnoser.sweep(state, obs[:, k:]) if diagnoser.sweep is not None and k == 1 and not signals else None
-        done = slice(k, k + 1) if several is None else slice(k, samples)
-        state, said = diagnoser.update(state, obs[:, k]) if several is None else several
-        recording.keep(k if several is None else done, said)
-        k = done.stop
+    state, recording = diagnoser.init(n), Recording(n, samples, signals)
+    for k in range(samples):
+        swept = diagnoser.sweep(state, obs[:, 1:]) if k == 1 and diagnoser.sweep is not None and not signals else None
+        if swept is not None:  # all but the first at once
+            recording.keep(slice(1, samples), swept[1])
+            break
+        state, said = diagnoser.update(state, obs[:, k])
+        recording.keep(k, said)
     return recording.decisions()
 
 

@@ -200,7 +200,7 @@ def swept(plant: Plant, sweep: Sweep) -> Callable[[Running, Array], tuple[Runnin
             before = np.concatenate([s.known[:, None], known[:, :-1]], axis=1)
             t = (s.k[:, None] + np.arange(K) - 1) * plant.dt
             flat = (a.reshape(n * K, *a.shape[2:]) for a in (t, before, known))
-            d = plant.measured_disturbance(*flat).reshape(n, K, -1)
+            d = plant.measured_disturbance(*flat).reshape(n, K, -1)  # type: ignore[arg-type]
         declared, tested, waiting = s.rule
         done = sweep(obs, d, s.k, *s.filter, declared, waiting)
         after = type(s.filter)(done.X, done.P, done.nu, done.S, done.count)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from fdi_gym.integration import LANES
-from fdi_gym.kernels import floats, helper
+from fdi_gym.kernels import helper
 from fdi_gym.vectors import above, choose, filled, load, root, store, zeros
 
 JITTER, RETRIES = 1e-14, 7  # added to the diagonal where the factorisation fails, times 100 at each retry
@@ -58,15 +58,30 @@ def take_matrix(A, lane, into):
 
 
 @helper
-def entry(given, row, i, j):
-    """Entry (i, j) of matrices (rows, r, c) that serve episodes in turn, the first lane's being number `row`."""
-    found = zeros() + given[0, i, j]
-    if given.shape[0] > 1:
-        lanes = floats((1, LANES))
-        for lane in range(LANES):
-            lanes[0, lane] = given[(row + lane) % given.shape[0], i, j]
-        found = load(lanes, 0, 0)
-    return found
+def in_turn(first, rows, whose):
+    """Which of so many rows, which serve episodes in turn, are the lanes' (LANES,), the first lane being episode `first`."""
+    for lane in range(LANES):
+        whose[lane] = (first + lane) % rows
+
+
+@helper
+def entry(given, whose, i, j, room):
+    """Entry (i, j) of matrices (rows, r, c) of which each lane has its own (`in_turn`); room (1, LANES)."""
+    if given.shape[0] == 1:
+        return zeros() + given[0, i, j]
+    for lane in range(LANES):
+        room[0, lane] = given[whose[lane], i, j]
+    return load(room, 0, 0)
+
+
+@helper
+def entry_of(given, whose, i, room):
+    """The same of vectors (rows, n)."""
+    if given.shape[0] == 1:
+        return zeros() + given[0, i]
+    for lane in range(LANES):
+        room[0, lane] = given[whose[lane], i]
+    return load(room, 0, 0)
 
 
 @helper
@@ -149,10 +164,10 @@ def through_matrix(F, P, m, N, where, many, cross, cov):
 
 
 @helper
-def predicted(row, mean, cross, cov, Q, limit, X, P):
+def predicted(mean, cross, cov, Q, whose, limit, X, P, room):
     """X and P become those one sample later: what f moves has mean and covariance cov, and cross with the rest, which stays.
 
-    Q (rows, N, N) comes upon it, the first lane's being number `row`; a variance beyond its limit is shrunk to it.
+    Q (rows, N, N) comes upon it, `whose` row being a lane's; a variance beyond its limit is shrunk to it.
     """
     n_x, N = mean.shape[0], X.shape[0]
     for i in range(N):
@@ -165,7 +180,7 @@ def predicted(row, mean, cross, cov, Q, limit, X, P):
                 total = load(cross, j * N + i, 0)
             else:
                 total = (load(P, i * N + j, 0) + load(P, j * N + i, 0)) * 0.5
-            total += entry(Q, row, i, j)
+            total += entry(Q, whose, i, j, room)
             store(P, i * N + j, 0, total)
             store(P, j * N + i, 0, total)
     for i in range(N):

@@ -83,7 +83,8 @@ def predict(rule, integers, reals, step, offset, direction, limit, plant, X, P, 
     Xs, Ps, ts, us, ds = lanes
     for first in range(0, n, LANES):
         aboard(first, X, P, t, u, known, lanes)
-        move(rule, integers, reals, step, offset, direction, limit, plant, first, Xs, Ps, ts, us, ds, Q, room)
+        some = min(LANES, n - first)
+        move(rule, integers, reals, step, offset, direction, limit, plant, first, some, Xs, Ps, ts, us, ds, Q, room)
         ashore(first, Xs, Ps, X1, P1)
 
 
@@ -150,8 +151,9 @@ def update(
         aboard(first, X, P, t, u, known, lanes)
         board_vectors(y, first, n // y.shape[0], ys)
         board_vectors(seen, first, n // y.shape[0], there)
+        some = min(LANES, n - first)
         found = hear(
-            rule, integers, reals, step, offset, direction, H, plain, first, Xs, Ps, ts, us, ds, ys, there, R, room,
+            rule, integers, reals, step, offset, direction, H, plain, first, some, Xs, Ps, ts, us, ds, ys, there, R, room,
             nus, Ss, Us,
         )  # fmt: skip
         store(distances, 0, 0, found)

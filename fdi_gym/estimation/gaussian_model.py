@@ -11,7 +11,7 @@ from fdi_gym.estimation.gaussian_points import ADDRESSES
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, NotApplicableError, Plant
 
-LARGEST = 200  # entries of an augmented state: matrices of its points lie on the stack
+LARGEST = 100  # entries of an augmented state: matrices of several episodes lie on the stack
 STEP = 1e-3  # of the central differences along the axes, in units of the entries' scales
 
 

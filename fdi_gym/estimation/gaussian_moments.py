@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fdi_gym.estimation.gaussian_algebra import entry
+from fdi_gym.estimation.gaussian_algebra import entry, entry_of
 from fdi_gym.estimation.gaussian_points import (
     DISTURBANCES,
     ENTRIES,
@@ -42,7 +42,6 @@ from fdi_gym.estimation.gaussian_points import (
     spread,
     squared_step,
 )
-from fdi_gym.integration import LANES
 from fdi_gym.kernels import floats, helper, inlined, ints, map_at
 from fdi_gym.tangent import tangent_at
 from fdi_gym.vectors import load, store, zeros
@@ -190,25 +189,13 @@ def heard(integers, reals, faults, offset, direction, plain, X, F, mean):
 
 
 @helper
-def of_line(offset, first, e):
-    """Entry e of the offsets (lines, p) of lanes, of which the first is on line `first`."""
-    found = zeros() + offset[0, e]
-    if offset.shape[0] > 1:
-        lanes = floats((1, LANES))
-        for lane in range(LANES):
-            lanes[0, lane] = offset[(first + lane) % offset.shape[0], e]
-        found = load(lanes, 0, 0)
-    return found
-
-
-@helper
-def linearised(integers, offset, direction, plant, first, X, u, known, F, mean):
+def linearised(integers, offset, direction, plant, line, X, u, known, F, mean, room):
     """mean = f(X) and F (n_x N) its Jacobian, for a plant x+ = g + A x + B u + G d + (E[0] + sum u_k E[1 + k]) dtheta.
 
-    plant (n_x, ...) has the columns [g, A, B, G, E[0], E[1], ...]. X, u, known, F and mean are in lanes (`gaussian_algebra`),
-    of which the first is on line `first`.
+    plant (n_x, ...) has the columns [g, A, B, G, E[0], E[1], ...]. X, u, known, F and mean are in lanes, as in
+    `gaussian_algebra`, each of which is on its `line` (LANES,); room (1, LANES).
     """
-    n_x, n_u, n_D, p, n_d = mean.shape[0], u.shape[0], known.shape[0], offset.shape[1], integers[DISTURBANCES]
+    n_x, n_u, n_D, p, n_d = mean.shape[0], u.shape[0], known.shape[0], direction.shape[1], integers[DISTURBANCES]
     B, N, n_m = 1 + n_x, X.shape[0], direction.shape[2]
     G = B + n_u
     E = G + n_D
@@ -226,11 +213,11 @@ def linearised(integers, offset, direction, plant, first, X, u, known, F, mean):
             gain = zeros() + plant[a, E + e]
             for k in range(n_u):
                 gain += load(u, k, 0) * plant[a, E + (1 + k) * p + e]
-            total += gain * of_line(offset, first, e)
+            total += gain * entry_of(offset, line, e, room)
             for j in range(n_m):
                 if direction.shape[0] > 1 or direction[0, e, j] != 0.0:
                     at = a * N + n_x + j
-                    store(F, at, 0, load(F, at, 0) + gain * entry(direction, first, e, j))
+                    store(F, at, 0, load(F, at, 0) + gain * entry(direction, line, e, j, room))
         for j in range(n_d):
             i = integers[SIZES + p + j]
             store(F, a * N + n_x + n_m + j, 0, zeros() + plant[a, G + i])

@@ -14,6 +14,7 @@ from fdi_gym.estimation.gaussian_algebra import (
     entries_of,
     entry,
     factor,
+    in_turn,
     predicted,
     take_matrix,
     take_vector,
@@ -48,46 +49,47 @@ def room_to_predict(rule, integers, reals, plant, N):
     mean, cross, cov = floats((n_x, LANES)), floats((n_x * N, LANES)), floats((n_x * n_x, LANES))
     F, where, many, Us = floats((n_x * N, LANES)), ints((n_x, N)), ints(n_x), floats((N * N if points else 0, LANES))
     one = floats(N), floats(integers[COMMANDS]), floats(integers[KNOWN]), floats(n_x), floats((N, N) if points else (0, 0))
+    whose = ints(LANES), ints(LANES), floats((1, LANES))
     tables = floats((n_x, row(N))), floats((n_x, n_x)), room_of(integers, reals, 0 if plant.shape[0] > 0 else row(N))
-    return mean, cross, cov, F, where, many, Us, one, tables
+    return mean, cross, cov, F, where, many, Us, one, tables, whose
 
 
 @helper
-def move(rule, integers, reals, step, offset, direction, limit, plant, first, X, P, t, u, known, Q, room):
-    """X and P one sample after t (LANES,); the first lane's is episode number `first`."""
-    mean, cross, cov, F, where, many, Us, (x, ue, de, moved, U), (table, across, inner) = room
+def move(rule, integers, reals, step, offset, direction, limit, plant, first, count, X, P, t, u, known, Q, room):
+    """X and P one sample after t (LANES,), of `count` episodes from number `first` on; further lanes are as the last."""
+    mean, cross, cov, F, where, many, Us, (x, ue, de, moved, U), (table, across, inner), (line, whose, room) = room
     n_x, N = mean.shape[0], X.shape[0]
     linear, points = plant.shape[0] > 0, plant.shape[0] == 0 and rule != EXTENDED
+    in_turn(first, offset.shape[0], line)
+    in_turn(first, Q.shape[0], whose)
     if linear:
-        linearised(integers, offset, direction, plant, first, X, u, known, F, mean)
+        linearised(integers, offset, direction, plant, line, X, u, known, F, mean, room)
     elif points:
         factor(P, N, Us)
     for lane in range(0 if linear else LANES):
-        line = (first + lane) % offset.shape[0]
-        take_vector(X, lane, x)
-        take_vector(u, lane, ue)
-        take_vector(known, lane, de)
+        if lane < count:
+            take_vector(X, lane, x)
+            take_vector(u, lane, ue)
+            take_vector(known, lane, de)
+            o, e = offset[line[lane]], direction[line[lane]]
+            if points:
+                take_matrix(Us, lane, U)
+                through(rule, True, integers, reals, o, e, t[lane], x, U, ue, de, moved, table, across)
+            elif integers[TANGENT] != 0:
+                differentiated(integers, reals, step, o, e, t[lane], x, ue, de, inner, table, moved)
+            else:
+                differenced(integers, reals, step, o, e, t[lane], x, ue, de, table, moved)
         if points:
-            take_matrix(Us, lane, U)
-            through(
-                rule, True, integers, reals, offset[line], direction[line], t[lane], x, U, ue, de, moved, table, across
-            )
             board_one(table, lane, N, cross)
             board_one(across, lane, n_x, cov)
         else:
-            if integers[TANGENT] != 0:
-                differentiated(
-                    integers, reals, step, offset[line], direction[line], t[lane], x, ue, de, inner, table, moved
-                )
-            else:
-                differenced(integers, reals, step, offset[line], direction[line], t[lane], x, ue, de, table, moved)
             board_one(table, lane, N, F)
         for i in range(n_x):
             mean[i, lane] = moved[i]
     if not points:
         entries_of(F, n_x, N, where, many)
         through_matrix(F, P, n_x, N, where, many, cross, cov)
-    predicted(first, mean, cross, cov, Q, limit, X, P)
+    predicted(mean, cross, cov, Q, whose, limit, X, P, room)
 
 
 @inlined
@@ -98,17 +100,22 @@ def room_to_hear(rule, integers, reals, H, N):
     white, where, many, Us = floats((m, LANES)), ints((m, N)), ints(m), floats((N * N if points else 0, LANES))
     one = floats(N), floats(integers[COMMANDS]), floats(integers[KNOWN]), floats(m), floats((N, N) if points else (0, 0))
     tables = floats((m, N)), floats((m, m)), room_of(integers, reals, 0)
-    return mean, cross, F, S, white, where, many, Us, one, tables, own_faults(integers), floats(N), floats(integers[OUTPUTS])
+    whose = ints(LANES), ints(LANES), floats((1, LANES))
+    sensors = own_faults(integers), floats(N), floats(integers[OUTPUTS])
+    return mean, cross, F, S, white, where, many, Us, one, tables, sensors, whose
 
 
 @helper
 def hear(
-    rule, integers, reals, step, offset, direction, H, plain, first, X, P, t, u, known, y, seen, R, room, nu, S, U
+    rule, integers, reals, step, offset, direction, H, plain, first, count, X, P, t, u, known, y, seen, R, room, nu, S, U
 ):  # fmt: skip
-    """X and P after the sensors y (m) at t (LANES,) that reported (seen > 0): nu' S^-1 nu; S = U' U."""
-    mean, cross, F, cov, white, where, many, Us, (xe, ue, de, read, Ue), (table, across, inner), faults, x, values = room
+    """X and P after the sensors y (m) at t (LANES,) that reported (seen > 0): nu' S^-1 nu; S = U' U. As `move`."""
+    mean, cross, F, cov, white, where, many, Us, one, (table, across, inner), (faults, x, values), (line, whose, room) = room
+    xe, ue, de, read, Ue = one
     m, N = mean.shape[0], X.shape[0]
     fixed, points = H.shape[0] > 0, H.shape[0] == 0 and rule != EXTENDED
+    in_turn(first, offset.shape[0], line)
+    in_turn(first, R.shape[0], whose)
     if fixed:
         for a in range(m):
             total = zeros()
@@ -120,24 +127,22 @@ def hear(
     elif points:
         factor(P, N, Us)
     for lane in range(0 if fixed else LANES):
-        line = (first + lane) % offset.shape[0]
-        take_vector(X, lane, xe)
-        take_vector(u, lane, ue)
-        take_vector(known, lane, de)
+        if lane < count:
+            take_vector(X, lane, xe)
+            take_vector(u, lane, ue)
+            take_vector(known, lane, de)
+            o, e = offset[line[lane]], direction[line[lane]]
+            if points:
+                take_matrix(Us, lane, Ue)
+                through(rule, False, integers, reals, o, e, t[lane], xe, Ue, ue, de, read, table, across)
+            elif plain.shape[0] > 0:
+                heard(integers, reals, faults, o, e, plain, xe, table, read)
+            else:
+                sensed(integers, reals, step, o, e, t[lane], xe, ue, de, inner, x, values, table, read)
         if points:
-            take_matrix(Us, lane, Ue)
-            through(
-                rule, False, integers, reals, offset[line], direction[line], t[lane], xe, Ue, ue, de, read, table, across
-            )
             board_one(table, lane, N, cross)
             board_one(across, lane, m, cov)
         else:
-            if plain.shape[0] > 0:
-                heard(integers, reals, faults, offset[line], direction[line], plain, xe, table, read)
-            else:
-                sensed(
-                    integers, reals, step, offset[line], direction[line], t[lane], xe, ue, de, inner, x, values, table, read
-                )
             board_one(table, lane, N, F)
         for a in range(m):
             mean[a, lane] = read[a]
@@ -147,24 +152,24 @@ def hear(
     for a in range(m):
         for b in range(a + 1):
             total = load(cov, a * m + b, 0)
-            store(cov, a * m + b, 0, total + entry(R, first, a, b))
-            store(cov, b * m + a, 0, total + entry(R, first, b, a))
+            store(cov, a * m + b, 0, total + entry(R, whose, a, b, room))
+            store(cov, b * m + a, 0, total + entry(R, whose, b, a, room))
     return correct(X, P, y, seen, mean, cov, cross, U, white, nu, S)
 
 
-@compiled(void(int64, *MODEL, V, M, int64, M, M, V, M, M, M3))
-def predict_lanes(rule, integers, reals, step, offset, direction, limit, plant, first, X, P, t, u, known, Q):
+@compiled(void(int64, *MODEL, V, M, int64, int64, M, M, V, M, M, M3))
+def predict_lanes(rule, integers, reals, step, offset, direction, limit, plant, first, count, X, P, t, u, known, Q):
     """`move`, for whoever has its episodes in lanes."""
     room = room_to_predict(rule, integers, reals, plant, X.shape[0])
-    move(rule, integers, reals, step, offset, direction, limit, plant, first, X, P, t, u, known, Q, room)
+    move(rule, integers, reals, step, offset, direction, limit, plant, first, count, X, P, t, u, known, Q, room)
 
 
-@compiled(void(int64, *MODEL, M, M, int64, M, M, V, M, M, M, M, M3, M, M))
+@compiled(void(int64, *MODEL, M, M, int64, int64, M, M, V, M, M, M, M, M3, M, M))
 def update_lanes(
-    rule, integers, reals, step, offset, direction, H, plain, first, X, P, t, u, known, y, seen, R, nu, S
+    rule, integers, reals, step, offset, direction, H, plain, first, count, X, P, t, u, known, y, seen, R, nu, S
 ):  # fmt: skip
     """`hear`, for whoever has its episodes in lanes."""
     room, U = room_to_hear(rule, integers, reals, H, X.shape[0]), floats(S.shape)
     hear(
-        rule, integers, reals, step, offset, direction, H, plain, first, X, P, t, u, known, y, seen, R, room, nu, S, U
+        rule, integers, reals, step, offset, direction, H, plain, first, count, X, P, t, u, known, y, seen, R, room, nu, S, U
     )  # fmt: skip

@@ -192,7 +192,8 @@ def decide_lanes(
     z (p, LANES) and P (p p, LANES), or where `fixed`, excess alone is the metric.
     """
     p, found = z.shape[0], room_to_fit(direction)
-    cost, variances, nothing, metric, (_, healthy, values, _) = floats(penalty.size), floats(p), floats(0), floats(P.shape), found
+    _, healthy, values, _ = found
+    cost, variances, nothing, metric = floats(penalty.size), floats(p), floats(0), floats(P.shape)
     for i in range(p * p):
         store(metric, i, 0, zeros() if fixed else load(P, i, 0))
     fit(z, metric, excess, faults, offset, direction, low, high, False, found)

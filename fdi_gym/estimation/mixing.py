@@ -12,7 +12,7 @@ from fdi_gym.integration import LANES
 from fdi_gym.kernels import compiled
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array
-from fdi_gym.vectors import load, minus, plus, store, width, zeros
+from fdi_gym.vectors import load, store, width, zeros
 
 M3, M4 = float64[:, :, ::1], float64[:, :, :, ::1]
 
@@ -51,18 +51,18 @@ def _mixture(w, X, P, mean, mixed):
             for c in range(0, W, LANES):
                 found = zeros()
                 for i in range(L):
-                    found = plus(found, w[e, j, i], load(points, i, c))
+                    found += load(points, i, c) * w[e, j, i]
                 store(points, L, c, found)
                 for i in range(L):
-                    store(spread, i, c, minus(load(points, i, c), 1.0, found))
+                    store(spread, i, c, load(points, i, c) - found)
             for r in range(N):
                 mean[e, j, r] = points[L, r]
                 for c in range(0, r + 1, LANES):
                     within, between = zeros(), zeros()
                     for i in range(L):
-                        within = plus(within, w[e, j, i], load(wide, i * N + r, c))
-                        between = plus(between, w[e, j, i] * spread[i, r], load(spread, i, c))
-                    store(total, 0, c, plus(within, 1.0, between))
+                        within += load(wide, i * N + r, c) * w[e, j, i]
+                        between += load(spread, i, c) * (w[e, j, i] * spread[i, r])
+                    store(total, 0, c, within + between)
                 for c in range(r + 1):
                     mixed[e, j, r, c] = mixed[e, j, c, r] = total[0, c]
 

@@ -66,11 +66,13 @@ def sweep_of(
     if decision is None or has_equivalents(plant):
         return None
     healthy = contiguous(plant.healthy)
-    head = (RULES[rule], *model.constants, model.limit, model.linear, model.H, model.plain, contiguous(Q[None]), contiguous(R[None]))
+    noises = contiguous(Q[None]), contiguous(R[None])
+    head = (RULES[rule], *model.constants, model.limit, model.linear, model.H, model.plain, *noises)
     age = Age(sweep_kernels.no_age, np.zeros(0)) if age is None else age
-    fixed, steps = decision.metric is not None, np.array([address(k) for k in (*sweep_kernels.STEPS, age.kernel)])
+    steps = np.array([address(kernel) for kernel in (*sweep_kernels.STEPS, age.kernel)])
+    metric = decision.excess if decision.metric is None else decision.metric[0]
     weighed = (
-        decision.metric[0] if fixed else decision.excess, fixed, decision.sets.labels, *decision.sets[1:], decision.penalty,
+        metric, decision.metric is not None, decision.sets.labels, *decision.sets[1:], decision.penalty,
         decision.limit, decision.lengths, healthy,
     )  # fmt: skip
 
@@ -78,7 +80,7 @@ def sweep_of(
         obs: Array, d: Array | None, k: Array, X: Array, P: Array, nu: Array, S: Array, count: Array, declared: Array,
         waiting: Array,
     ) -> Swept:  # fmt: skip
-        """Over obs (n, K, n_obs) with the measured disturbances d (n, K, n_D), from sample k (n,) on; the state as `Swept`."""
+        """Over obs (n, K, n_obs) with measured disturbances d (n, K, n_D), from sample k (n,) on; states as in `Swept`."""
         n, K, _ = obs.shape
         known = np.zeros((n, K, len(plant.disturbances))) if d is None else contiguous(d)
         after = [np.array(a, order="C") for a in (X, P, nu, S, count, declared, waiting)]
@@ -87,6 +89,6 @@ def sweep_of(
         sweep_kernels.sweep(
             steps, age.constants, *head, *weighed, contiguous(obs), known, k, *after, alarm, label, estimate, std, state,
         )  # fmt: skip
-        return Swept(*after, alarm, label, estimate, std, state)
+        return Swept._make([*after, alarm, label, estimate, std, state])
 
     return sweep

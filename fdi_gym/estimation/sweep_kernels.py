@@ -56,8 +56,8 @@ def tell(x, z, P, healthy, lane, estimate, std, state):
 
 @compiled(
     void(
-        I1, V, int64, *MODEL, V, M, M, M, M3, M3, M, boolean, I1, *SETS, V, float64, I1, V, M3, M3, I1, M, M3, M, M3, I1, I2, M,
-        boolean[:, ::1], int16[:, ::1], M3, M3, M3,
+        I1, V, int64, *MODEL, V, M, M, M, M3, M3, M, boolean, I1, *SETS, V, float64, I1, V,
+        M3, M3, I1, M, M3, M, M3, I1, I2, M, boolean[:, ::1], int16[:, ::1], M3, M3, M3,
     )
 )  # fmt: skip
 def sweep(
@@ -84,6 +84,7 @@ def sweep(
     stands, waits = ints((LANES, 5)), floats((LANES, 2 + p))
     zs = Xs[n_x : n_x + p]
     for first in range(0, n, LANES):
+        some = min(LANES, n - first)
         board_vectors(X, first, 1, Xs)
         board_matrices(P, first, Ps)
         for lane in range(LANES):
@@ -98,7 +99,7 @@ def sweep(
             for lane in range(LANES):
                 ts[lane] = ks[lane] * reals[0]
                 ks[lane] += 1
-            predict(rule, integers, reals, step, offset, direction, limit, plant, first, Xs, Ps, ts, us, ds, Q)
+            predict(rule, integers, reals, step, offset, direction, limit, plant, first, some, Xs, Ps, ts, us, ds, Q)
             age(ages, n_x, Ps)
             for lane in range(LANES):
                 ts[lane] = ks[lane] * reals[0]
@@ -106,19 +107,21 @@ def sweep(
                 for a in range(m):
                     informed[lane] = informed[lane] or there[a, lane] > 0.0
             update(
-                rule, integers, reals, step, offset, direction, H, plain, first, Xs, Ps, ts, us, ds, ys, there, R, nus, Ss
-            )
+                rule, integers, reals, step, offset, direction, H, plain, first, some, Xs, Ps, ts, us, ds, ys, there, R, nus,
+                Ss,
+            )  # fmt: skip
             for i in range(p):
                 for j in range(p):
                     store(Pz, i * p + j, 0, load(Ps, (n_x + i) * N + n_x + j, 0))
             decide(
-                zs, Pz, excess, fixed, labels, faults, at, along, low, high, penalty, rise, after, ks, informed, stands, waits
-            )
-            for lane in range(min(LANES, n - first)):
+                zs, Pz, excess, fixed, labels, faults, at, along, low, high, penalty, rise, after, ks, informed, stands,
+                waits,
+            )  # fmt: skip
+            for lane in range(some):
                 e = first + lane
                 alarm[e, k], label[e, k] = stands[lane, 0] > 0, stands[lane, 0]
                 tell(Xs, zs, Pz, healthy, lane, estimate[e, k], std[e, k], state[e, k])
-        for lane in range(min(LANES, n - first)):
+        for lane in range(some):
             e = first + lane
             take_vector(Xs, lane, X[e])
             take_matrix(Ps, lane, P[e])
