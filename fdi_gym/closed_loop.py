@@ -28,6 +28,7 @@ from fdi_gym.kernels import (
     known_at,
     map_at,
     outside_at,
+    put,
     words,
 )
 from fdi_gym.noise import white
@@ -141,12 +142,9 @@ def fly(
             for i in range(LANES):
                 slot = beside[i]
                 k, moving[i], segment[i] = sample[slot], i < width, 0
-                for j in range(n):
-                    x[i, j] = X[slot, j]
-                for j in range(n_u):
-                    u[i, j] = U[slot, j]
-                for j in range(n_p):
-                    p[i, j] = P[slot, j]
+                put(X[slot], x[i])
+                put(U[slot], u[i])
+                put(P[slot], p[i])
                 until[i] = theta_over(k, True, dt, slot, effects, counts, values, held, nominal, i, courses, drifts, theta_k)
                 if process_noise[slot]:
                     _injected(k, steps[slot], end - tile, process_noise[slot], sensor_noise[slot], n_y, noise[i])
@@ -190,10 +188,8 @@ def fly(
                     while labels[slot, segment[i] + 1, 0] <= k:
                         segment[i] += 1
                     label[row, slot] = labels[slot, segment[i], 1]
-                    for j in range(n):
-                        state[row, slot, j] = x[i, j]
-                    for j in range(n_theta):
-                        theta[row, slot, j] = THETA[slot, j]
+                    put(x[i], state[row, slot])
+                    put(THETA[slot], theta[row, slot])
                     if k == last or status[slot] == ENDED:
                         status[slot] = TERMINATED if status[slot] == ENDED else OVER
                         steps[slot], moving[i] = k, False
@@ -220,8 +216,7 @@ def fly(
                         after[i, j] += noise[i, s - tile, n_y + j]
                         finite &= abs(after[i, j]) < np.inf
                     if finite:  # else the state has left the numbers: the last finite one is what is shown
-                        for j in range(n):
-                            x[i, j] = after[i, j]
+                        put(after[i], x[i])
                     sample[slot] = k + 1
                     references = floats_at(reference_at[slot], (steps[slot] + 1, n_r))
                     for j in range(n_r):
@@ -229,7 +224,5 @@ def fly(
                     if not finite or outside(t[i] + dt, x[i], r):
                         status[slot] = ENDED
             for i in range(width):
-                for j in range(n):
-                    X[beside[i], j] = x[i, j]
-                for j in range(n_u):
-                    U[beside[i], j] = u[i, j]
+                put(x[i], X[beside[i]])
+                put(u[i], U[beside[i]])

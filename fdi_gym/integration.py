@@ -5,13 +5,7 @@ from typing import Any
 import numpy as np
 from numba import boolean, float64, int64, void
 
-from fdi_gym.kernels import M, V, around, compiled, floats, function_at, helper, inside, map_at, stack
-
-
-@helper
-def _copy(table, i, other, j):
-    for a in range(other.shape[1]):
-        other[j, a] = table[i, a]
+from fdi_gym.kernels import M, V, around, compiled, floats, function_at, inside, map_at, put, stack
 
 
 @inside
@@ -180,19 +174,19 @@ def propagate(interval_address, lanes_address, dt, substeps, t, x, u, theta, d, 
         for lane in range(LANES):
             i = min(first + lane, points - 1)
             T[lane] = t[i // every_t]
-            _copy(x, i, X, lane)
-            _copy(u, i // every_u, U, lane)
-            _copy(theta, i // every_theta, THETA, lane)
-            _copy(d, i // every_d, D, lane)
-            _copy(p, i // every_p, P, lane)
+            put(x[i], X[lane])
+            put(u[i // every_u], U[lane])
+            put(theta[i // every_theta], THETA[lane])
+            put(d[i // every_d], D[lane])
+            put(p[i // every_p], P[lane])
         if count >= FEW:
             lanes(T, dt, substeps, X, U, THETA, D, P, X)
         else:
             for lane in range(count):
-                _copy(THETA, lane, course, 0)
+                put(THETA[lane], course[0])
                 interval(T[lane], dt, substeps, False, X[lane], U[lane], course, D[lane], P[lane], theta_now)
         for lane in range(count):
-            _copy(X, lane, out, first + lane)
+            put(X[lane], out[first + lane])
 
 
 @compiled(void(int64, V, M, M, M, M, M, M))

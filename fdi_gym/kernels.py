@@ -71,6 +71,14 @@ helper = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=Tru
 inlined = njit(error_model="numpy", inline="always")  # becomes a part of its caller: it may make what that works with
 inside = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True)  # an author's own
 
+
+@helper
+def put(values, into):
+    """Put values (n,) into the first entries of a vector."""
+    for i in range(values.size):
+        into[i] = values[i]
+
+
 _signatures: dict[Any, Any] = {}  # of the kernels, compiled when they are first needed
 _announced: set[str] = set()  # source files whose cold compilation has been announced
 _compiling = threading.RLock()

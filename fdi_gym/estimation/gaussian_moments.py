@@ -37,12 +37,11 @@ from fdi_gym.estimation.gaussian_points import (
     enters,
     moments_of_points,
     pass_points,
-    put,
     put_magnitudes,
     spread,
     squared_step,
 )
-from fdi_gym.kernels import floats, helper, inlined, ints, map_at
+from fdi_gym.kernels import floats, helper, inlined, ints, map_at, put
 from fdi_gym.tangent import tangent_at
 from fdi_gym.vectors import load, store, zeros
 

@@ -8,19 +8,12 @@ from __future__ import annotations
 import numpy as np
 
 from fdi_gym.integration import LANES, lanes_at
-from fdi_gym.kernels import floats, helper, map_at
+from fdi_gym.kernels import floats, helper, map_at, put
 
 EXTENDED, UNSCENTED, CENTRAL_DIFFERENCE = 0, 1, 2
 # The integers of a model: three addresses (the last may be 0), sizes, then the lists (entries, disturbances, sensors)
 OF_LANES, OUTPUT, TANGENT, ADDRESSES = range(4)
 SUBSTEPS, STATES, OUTPUTS, THETA, KNOWN, ENTRIES, DISTURBANCES, SENSORS, OWN, COMMANDS, SIZES = range(ADDRESSES, 14)
-
-
-@helper
-def put(values, into):
-    """Put values (n,) into the first entries of a vector."""
-    for i in range(values.size):
-        into[i] = values[i]
 
 
 @helper

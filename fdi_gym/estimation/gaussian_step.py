@@ -57,13 +57,13 @@ def room_to_predict(rule, integers, reals, plant, N):
 @helper
 def move(rule, integers, reals, step, offset, direction, limit, plant, first, count, X, P, t, u, known, Q, room):
     """X and P one sample after t (LANES,), of `count` episodes from number `first` on; further lanes are as the last."""
-    mean, cross, cov, F, where, many, Us, (x, ue, de, moved, U), (table, across, inner), (line, whose, room) = room
+    mean, cross, cov, F, where, many, Us, (x, ue, de, moved, U), (table, across, inner), (line, whose, spare) = room
     n_x, N = mean.shape[0], X.shape[0]
     linear, points = plant.shape[0] > 0, plant.shape[0] == 0 and rule != EXTENDED
     in_turn(first, offset.shape[0], line)
     in_turn(first, Q.shape[0], whose)
     if linear:
-        linearised(integers, offset, direction, plant, line, X, u, known, F, mean, room)
+        linearised(integers, offset, direction, plant, line, X, u, known, F, mean, spare)
     elif points:
         factor(P, N, Us)
     for lane in range(0 if linear else LANES):
@@ -89,7 +89,7 @@ def move(rule, integers, reals, step, offset, direction, limit, plant, first, co
     if not points:
         entries_of(F, n_x, N, where, many)
         through_matrix(F, P, n_x, N, where, many, cross, cov)
-    predicted(mean, cross, cov, Q, whose, limit, X, P, room)
+    predicted(mean, cross, cov, Q, whose, limit, X, P, spare)
 
 
 @inlined
@@ -110,8 +110,8 @@ def hear(
     rule, integers, reals, step, offset, direction, H, plain, first, count, X, P, t, u, known, y, seen, R, room, nu, S, U
 ):  # fmt: skip
     """X and P after the sensors y (m) at t (LANES,) that reported (seen > 0): nu' S^-1 nu; S = U' U. As `move`."""
-    mean, cross, F, cov, white, where, many, Us, one, (table, across, inner), (faults, x, values), (line, whose, room) = room
-    xe, ue, de, read, Ue = one
+    mean, cross, F, cov, white, where, many, Us, one, (table, across, inner), (faults, x, values), lanes = room
+    (xe, ue, de, read, Ue), (line, whose, spare) = one, lanes
     m, N = mean.shape[0], X.shape[0]
     fixed, points = H.shape[0] > 0, H.shape[0] == 0 and rule != EXTENDED
     in_turn(first, offset.shape[0], line)
@@ -152,8 +152,8 @@ def hear(
     for a in range(m):
         for b in range(a + 1):
             total = load(cov, a * m + b, 0)
-            store(cov, a * m + b, 0, total + entry(R, whose, a, b, room))
-            store(cov, b * m + a, 0, total + entry(R, whose, b, a, room))
+            store(cov, a * m + b, 0, total + entry(R, whose, a, b, spare))
+            store(cov, b * m + a, 0, total + entry(R, whose, b, a, spare))
     return correct(X, P, y, seen, mean, cov, cross, U, white, nu, S)
 
 
