@@ -18,7 +18,17 @@ from conftest import PLANTS, build
 from numpy.testing import assert_allclose
 from safetensors.numpy import load_file, save_file
 
-from baselines.learned import _attention, attention, features, flights, probabilities, recipes, sequence_net, weights
+from baselines.learned import (
+    _attention,
+    attention,
+    features,
+    flights,
+    probabilities,
+    recipes,
+    sequence_net,
+    streams,
+    weights,
+)
 from baselines.learned._network import SequenceNetwork, loss
 from baselines.learned._supervised import SupervisedTraining
 from baselines.learned.features import FeatureShape
@@ -82,12 +92,12 @@ def test_features_of_a_stream_are_those_of_the_whole_flight(plant_id, shape):
     z = features.blocks(plant, record.obs, shape.stride)
     delta = flights.at_steps(features.deviation(plant, record.target), shape.stride)[:, : z.shape[1]]
     model = features.identify(plant, shape, [(z, delta)])
-    model = features.standardised(plant, shape, model, z)
+    model = streams.standardised(plant, shape, model, [record.obs])
     assert {f"model.{k}": a.shape for k, a in model._asdict().items()} == features.tensor_shapes(plant, shape)
-    whole = features.features(plant, shape, model, z)
-    stream, seen = features.begin(plant, shape, 4), []
+    whole = streams.features(plant, shape, model, record.obs)
+    stream, seen = streams.begin(plant, shape, 4), []
     for k in range(record.obs.shape[1]):
-        stream, found = features.add(plant, shape, model, stream, record.obs[:, k], k)
+        stream, found = streams.add(plant, shape, model, stream, record.obs[:, k], k)
         seen += [] if found is None else [found]
     assert np.allclose(np.stack(seen, axis=1), whole, atol=1e-5)
 
@@ -97,7 +107,7 @@ def test_identified_residuals_are_white_where_the_plant_is_linear_and_healthy():
     record = flights.fly(plant, Condition("fault-free", {}), range(TRAINING, TRAINING + 40))
     z = features.blocks(plant, record.obs, 1)
     model = features.identify(plant, shape, [(z, np.zeros((*z.shape[:2], 4)))])
-    phi, psi = features._sequences(plant, shape, z)
+    phi, psi = features.sequences(plant, shape, z)
     e, _, _ = features.information(model, phi, psi, z[:, 20:, 0, :4])
     assert np.allclose(np.cov(e.reshape(-1, 4).T), np.eye(4), atol=0.05)
     assert abs(np.mean(e[:, 1:] * e[:, :-1])) < 0.02
@@ -113,9 +123,9 @@ def test_a_sensor_that_does_not_report_says_nothing(plant_id):
     model = features.identify(plant, shape, [(z, delta)])
 
     def after(obs, samples):
-        stream = features.begin(plant, shape, len(obs))
+        stream = streams.begin(plant, shape, len(obs))
         for k in range(samples):
-            stream, _ = features.add(plant, shape, model, stream, obs[:, k], k)
+            stream, _ = streams.add(plant, shape, model, stream, obs[:, k], k)
         return stream
 
     before = after(obs, 100)
@@ -145,7 +155,7 @@ def test_streamed_diagnoses_are_those_of_the_whole_sequence(path):
     shape, model = weights.shape_of(path, card)[0], weights.model_of(tensors)
     record = flights.fly(plant, condition, range(VALIDATION, VALIDATION + 3))
     obs = record.obs[:, : 20 * shape.period + 3]
-    seen = [features.features(plant, shape, model, features.blocks(plant, obs, shape.stride))]
+    seen = [streams.features(plant, shape, model, obs)]
     seen.append(flights.context(np.zeros(3, int), len(card.processes), 20))
     told = flights.filters_features(plant, condition, card.filters, obs, shape.period)
     x = torch.from_numpy(np.concatenate([*seen, *told], axis=2)).double()
