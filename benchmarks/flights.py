@@ -36,7 +36,7 @@ from fdi_gym.tables import markdown
 METHOD, REFERENCE = "residual_net", "onset_bank"
 HALVINGS = 3
 TREND = 3  # of the largest budgets the trend is taken
-POINTS = {"hard": 3.0}  # that are left of the gap when it counts as closed; 1 elsewhere
+POINTS = {"standard": 1.0, "hard": 3.0}  # of the conditions with a reference: the gap that counts as closed
 FLAT, FAR = 0.5, 10  # points a doubling that are as good as none; doublings beyond which nothing is foretold
 HOME = Path(__file__).parent.parent / "leaderboards" / "learning"
 INTRODUCTION = """# How many flights more
@@ -106,6 +106,27 @@ def trend(budgets, scores, reference, points):
     return slope, budgets[-1] * 2.0 ** np.where(closed, 0.0, np.clip(doublings, 0.0, FAR + 1.0))
 
 
+def curve_of(budgets, drawn, points):
+    """The scores of the budgets and what a doubling gives; with a reference the gap, and the flights that close it."""
+
+    def interval(values):
+        return np.quantile(values, (0.025, 0.975)).round(2).tolist()
+
+    scores, again = 100 * drawn.score, 100 * drawn.again
+    n = len(budgets)
+    reference, others = (scores[-1], again[:, -1]) if points is not None else (np.inf, np.inf)
+    slope, needed = trend(budgets, scores[:n], reference, points or 0.0)
+    slopes, all_needed = trend(budgets, again[:, :n], others, points or 0.0)
+    found = {"scores": scores[:n].round(2).tolist(), "doubling": [round(float(slope), 2), *interval(slopes)]}
+    if points is None:
+        return found
+    gaps = [(100 * np.array(drawn.difference(REFERENCE, str(budget)))).round(2).tolist() for budget in budgets]
+    return found | {
+        "attained": round(float(reference), 2), "points": points, "gaps": gaps,
+        "needed": [round(float(needed)), *interval(all_needed)],
+    }  # fmt: skip
+
+
 def measured(plant_id, work):
     """The curves of a plant, one per condition."""
     plant, flown = load_plant(plant_id), {}
@@ -117,22 +138,13 @@ def measured(plant_id, work):
         zip(runs[-1].plants, recipe.conditions, runs[-1].validation[1], strict=True)
     ):
         every = {str(n): declared(run, i) for n, run in zip(budgets, runs, strict=True)}
-        every[REFERENCE] = run_diagnoser(make_diagnoser(REFERENCE, own, process=condition.process), record.obs)
+        if condition.name in POINTS:
+            every[REFERENCE] = run_diagnoser(make_diagnoser(REFERENCE, own, process=condition.process), record.obs)
         scoring = own.process(condition.process).scoring
         outcomes = {
             name: [outcome(own, scoring, record, said, j) for j in range(len(record.obs))] for name, said in every.items()
         }
-        drawn = draw_again(outcomes, len(own.labels))
-        points = POINTS.get(condition.process, 1.0)
-        scores, again = 100 * drawn.score, 100 * drawn.again
-        slope, needed = trend(budgets, scores[:-1], scores[-1], points)
-        slopes, all_needed = trend(budgets, again[:, :-1], again[:, -1], points)
-        found[condition.name] = {
-            "attained": round(scores[-1], 2), "scores": scores[:-1].round(2).tolist(), "points": points,
-            "gaps": [(100 * np.array(drawn.difference(REFERENCE, str(n)))).round(2).tolist() for n in budgets],
-            "doubling": [round(float(slope), 2), *np.quantile(slopes, (0.025, 0.975)).round(2).tolist()],
-            "needed": [round(float(needed)), *np.quantile(all_needed, (0.025, 0.975)).round().tolist()],
-        }  # fmt: skip
+        found[condition.name] = curve_of(budgets, draw_again(outcomes, len(own.labels)), POINTS.get(condition.name))
         print(plant_id, condition.name, found[condition.name], flush=True)
     return {"budgets": budgets, "filters": list(recipe.filters), "validation": recipe.validation, "curves": found}
 
@@ -154,13 +166,13 @@ def section(found):
     """The table of a plant."""
     budgets, rows = found["budgets"], []
     for name, curve in found["curves"].items():
-        gap, low, high = curve["gaps"][-1]
         slope, least, most = curve["doubling"]
-        rows.append([
-            name, *(f"{score:.1f}" for score in curve["scores"]), f"{curve['attained']:.1f}",
-            f"{gap:.1f} [{low:.1f}, {high:.1f}]", f"{slope:+.1f} [{least:+.1f}, {most:+.1f}]", forecast(curve, budgets[-1]),
-        ])  # fmt: skip
-    head = ["condition", *(f"{n} flights" for n in budgets), REFERENCE, "gap", "a doubling", "flights that close it"]
+        line = [name, *(f"{score:.1f}" for score in curve["scores"]), f"{slope:+.1f} [{least:+.1f}, {most:+.1f}]"]
+        if "gaps" in curve:
+            gap, low, high = curve["gaps"][-1]
+            line += [f"{curve['attained']:.1f}", f"{gap:.1f} [{low:.1f}, {high:.1f}]", forecast(curve, budgets[-1])]
+        rows.append(line + ["-"] * (len(budgets) + 5 - len(line)))
+    head = ["condition", *(f"{n} flights" for n in budgets), "a doubling", REFERENCE, "gap", "flights that close it"]
     shown = " and ".join(f"`{name}`" for name in found["filters"])
     return f"## {{}}\n\nShown {shown}; {found['validation']} validation flights per condition.\n\n" + markdown(head, rows)
 
@@ -172,7 +184,8 @@ def picture(every, path):
     for axes, (plant, found) in zip(np.atleast_1d(figure.subplots(1, len(every))), sorted(every.items()), strict=True):
         for i, (name, curve) in enumerate(found["curves"].items()):
             line = panels.drawn(axes, found["budgets"], curve["scores"], i, marker=".", markersize=5, label=name)
-            axes.axhline(curve["attained"], color=line.get_color(), lw=0.8, ls=":")
+            if "attained" in curve:
+                axes.axhline(curve["attained"], color=line.get_color(), lw=0.8, ls=":")
             handles.setdefault(name, line)
         axes.set_xscale("log", base=2)
         axes.set_xticks(found["budgets"], [str(n) for n in found["budgets"]])
