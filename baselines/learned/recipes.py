@@ -128,6 +128,7 @@ FILTERS = {  # that residual_net is shown, and training flights per condition: f
     "HUAVHover": (("hypothesis_bank", "ascdkf"), 1000),
     "MissilePitch": (("augmented_ekf_imm", "augmented_ekf_mode_probabilities"), 600),
     "CMGSatellite": (("mekf",), 400),
+    "ThreeTank": (("augmented_ekf", "multiple_model_ekf"), 1200),
 }
 # fault windows in a flight that networks are shown, and their pace: whole flights are long, and its suites are so too
 WINDOWS = {"CMGSatellite": {"standard": (3, 0.2), "mixed": (3, 0.1)}}
