@@ -17,6 +17,7 @@ from pathlib import Path
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[name] = "1"
 
+import joblib
 import numpy as np
 
 from baselines.learned import flights as data
@@ -24,8 +25,7 @@ from baselines.learned import weights
 from baselines.learned._supervised import SupervisedTraining
 from baselines.learned.recipes import residual_recipe
 from fdi_gym.comparison import draw_again
-from fdi_gym.diagnosis import make_diagnoser
-from fdi_gym.diagnosis import run as run_diagnoser
+from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.diagnosis.contract import Decisions
 from fdi_gym.discovery import load_plant
 from fdi_gym.files import write_whole
@@ -76,13 +76,13 @@ class Shared(SupervisedTraining):
 def trained(plant, budget, work, flown):
     """A finished run with so many flights."""
     base = weights.WEIGHTS / f"{weights.stem('sequence_net', plant)}.safetensors"
-    run = Shared(
+    found = Shared(
         METHOD, plant, residual_recipe(plant, budget), seed=0, work=work / f"{weights.stem(METHOD, plant)}-{budget}",
         base=base, command=weights.command(METHOD, plant, None if budget == residual_recipe(plant).flights else budget, 0),
         flown=flown,
     )  # fmt: skip
-    run.run()
-    return run
+    found.run()
+    return found
 
 
 def declared(training, index):
@@ -91,6 +91,16 @@ def declared(training, index):
     label = training.logits(flown).argmax(axis=2)[flown.process == index]
     held = data.at_samples(label, training.recipe.shape.period, records[index].label.shape[1])
     return Decisions(held > 0, held, None, None, None)
+
+
+def judged(plant, process, obs):
+    """What the reference says of flights; halves of them side by side."""
+
+    def labels(some):
+        return run(make_diagnoser(REFERENCE, plant, process=process), some).label
+
+    label = np.concatenate(joblib.Parallel(2)(joblib.delayed(labels)(some) for some in np.array_split(obs, 2)))
+    return Decisions(label > 0, label, None, None, None)
 
 
 def trend(budgets, scores, reference, points):
@@ -137,9 +147,9 @@ def measured(plant_id, work):
     for i, (own, condition, record) in enumerate(
         zip(runs[-1].plants, recipe.conditions, runs[-1].validation[1], strict=True)
     ):
-        every = {str(n): declared(run, i) for n, run in zip(budgets, runs, strict=True)}
+        every = {str(n): declared(one, i) for n, one in zip(budgets, runs, strict=True)}
         if condition.name in POINTS:
-            every[REFERENCE] = run_diagnoser(make_diagnoser(REFERENCE, own, process=condition.process), record.obs)
+            every[REFERENCE] = judged(own, condition.process, record.obs)
         scoring = own.process(condition.process).scoring
         outcomes = {
             name: [outcome(own, scoring, record, said, j) for j in range(len(record.obs))] for name, said in every.items()

@@ -124,7 +124,7 @@ SEQUENCES = {
     ),
 }  # fmt: skip
 FILTERS = {  # that residual_net is shown, and training flights per condition: filters cost more than networks
-    "B747Lateral": (("bayes_bank", "switching_bayes_bank"), 600),
+    "B747Lateral": (("onset_bank", "switching_bayes_bank"), 600),
     "HUAVHover": (("hypothesis_bank", "ascdkf"), 1000),
     "MissilePitch": (("augmented_ekf_imm", "augmented_ekf_mode_probabilities"), 600),
     "CMGSatellite": (("mekf",), 400),
