@@ -1,12 +1,12 @@
 """How many training flights a network that is shown filters would need: it is trained with ever more, and scored.
 
-    python benchmarks/flights.py PLANT [--work runs]
+    python benchmarks/flights.py PLANT [--gaps standard hard] [--work runs]
 
 The largest budget is the recipe's, the others a half, a quarter and an eighth of it. Each run gives the weights of
 `fdi-gym train residual_net PLANT --budget N` and goes on where it was killed; flights are flown and shown to the filters
 once for all. All are scored on the validation flights of each condition, and so is `onset_bank`, the best that is known to
-be attained on most. Writes leaderboards/learning/flights.json, and from it flights.md and flights.png; what these say of
-other plants stays.
+be attained, under those named. Writes leaderboards/learning/flights.json, and from it flights.md and flights.png; what these
+say of other plants stays.
 """
 
 import argparse
@@ -36,7 +36,7 @@ from fdi_gym.tables import markdown
 METHOD, REFERENCE = "residual_net", "onset_bank"
 HALVINGS = 3
 TREND = 3  # of the largest budgets the trend is taken
-POINTS = {"standard": 1.0, "hard": 3.0}  # of the conditions with a reference: the gap that counts as closed
+POINTS = {"standard": 1.0, "hard": 3.0}  # that are left of a gap that counts as closed
 FLAT, FAR = 0.5, 10  # points a doubling that are as good as none; doublings beyond which nothing is foretold
 HOME = Path(__file__).parent.parent / "leaderboards" / "learning"
 INTRODUCTION = """# How many flights more
@@ -137,8 +137,8 @@ def curve_of(budgets, drawn, points):
     }  # fmt: skip
 
 
-def measured(plant_id, work):
-    """The curves of a plant, one per condition."""
+def measured(plant_id, gaps, work):
+    """The curves of a plant, one per condition; those of the gaps with the reference."""
     plant, flown = load_plant(plant_id), {}
     recipe = residual_recipe(plant)
     budgets = [recipe.flights >> i for i in reversed(range(HALVINGS + 1))]
@@ -148,13 +148,14 @@ def measured(plant_id, work):
         zip(runs[-1].plants, recipe.conditions, runs[-1].validation[1], strict=True)
     ):
         every = {str(n): declared(one, i) for n, one in zip(budgets, runs, strict=True)}
-        if condition.name in POINTS:
+        points = POINTS[condition.name] if condition.name in gaps else None
+        if points is not None:
             every[REFERENCE] = judged(own, condition.process, record.obs)
         scoring = own.process(condition.process).scoring
         outcomes = {
             name: [outcome(own, scoring, record, said, j) for j in range(len(record.obs))] for name, said in every.items()
         }
-        found[condition.name] = curve_of(budgets, draw_again(outcomes, len(own.labels)), POINTS.get(condition.name))
+        found[condition.name] = curve_of(budgets, draw_again(outcomes, len(own.labels)), points)
         print(plant_id, condition.name, found[condition.name], flush=True)
     return {"budgets": budgets, "filters": list(recipe.filters), "validation": recipe.validation, "curves": found}
 
@@ -216,11 +217,12 @@ def page(every):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("plant")
+    parser.add_argument("--gaps", nargs="+", choices=POINTS, default=list(POINTS), help="conditions with the reference")
     parser.add_argument("--work", type=Path, default=Path("runs"))
     arguments = parser.parse_args()
     file = HOME / "flights.json"
     every = json.loads(file.read_text()) if file.exists() else {}
-    every[arguments.plant] = measured(arguments.plant, arguments.work)
+    every[arguments.plant] = measured(arguments.plant, arguments.gaps, arguments.work)
     write_whole(file, (json.dumps(dict(sorted(every.items())), indent=1) + "\n").encode())
     write_whole(HOME / "flights.md", page(every).encode())
     picture(every, HOME / "flights.png")

@@ -452,6 +452,19 @@ def test_learned_methods_see_through_gaps_or_are_held_and_their_entry_says_so(na
             assert np.isfinite(value).all(), field
 
 
+@pytest.mark.parametrize("path", [p for p in NETWORKS if "residual_net" not in p.stem], ids=lambda p: p.stem)
+def test_shipped_networks_go_on_through_gaps_where_their_model_is_linear_or_they_have_learned_to(path):
+    card = weights.read_card(path)
+    plant = load_plant(card.plant, **{**card.options[0], **recipes.DROPOUT})
+    diagnoser = make_diagnoser(card.method, plant, process=card.processes[0])
+    shape = weights.shape_of(path, card)[0]
+    assert diagnoser.gaps == (shape.linear or shape.shares)
+    assert shape.shares == any(name.endswith(weights.MISSING) for name in card.processes)
+    obs = flights.fly(plant, Condition(card.processes[0], card.options[0]), range(VALIDATION, VALIDATION + 2)).obs[:, :200]
+    assert np.isnan(obs).any()
+    assert np.isfinite(run(diagnoser, obs).label_probs).all()
+
+
 def test_calibration_recovers_a_temperature_and_improves_the_log_score():
     rng = np.random.default_rng(0)
     logits = rng.standard_normal((20000, 3)) * 2

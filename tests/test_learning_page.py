@@ -64,7 +64,7 @@ def test_the_page_of_the_flights_is_what_was_measured():
     for plant, found in json.loads(text).items():
         card = weights.read_card(weights.WEIGHTS / f"residual_net-{plant}.safetensors")
         assert card.filters == found["filters"]
-        for curve in (found["curves"][name] for name in flights.POINTS):
+        for curve in (curve for curve in found["curves"].values() if "gaps" in curve):
             gap, low, high = np.array(curve["gaps"]).T
             assert gap == pytest.approx(curve["attained"] - np.array(curve["scores"]), abs=0.02)
             assert np.all((low <= gap) & (gap <= high))
