@@ -1,12 +1,12 @@
 """How many training flights a network that is shown filters would need: it is trained with ever more, and scored.
 
-    python benchmarks/flights.py PLANT [--gaps standard hard] [--work runs]
+    python benchmarks/flights.py PLANT [--budget N] [--gaps standard hard] [--work runs]
 
-The largest budget is the recipe's, the others a half, a quarter and an eighth of it. Each run gives the weights of
-`fdi-gym train residual_net PLANT --budget N` and goes on where it was killed; flights are flown and shown to the filters
-once for all. All are scored on the validation flights of each condition, and so is `onset_bank`, the best that is known to
-be attained, under those named. Writes leaderboards/learning/flights.json, and from it flights.md and flights.png; what these
-say of other plants stays.
+The largest budget is the recipe's or that given, the others a half, a quarter and an eighth of it. Each run gives the
+weights of `fdi-gym train residual_net PLANT --budget N` and goes on where it was killed; flights are flown and shown to the
+filters once for all. All are scored on the validation flights of each condition, and so is `onset_bank`, the best that is
+known to be attained, under those named. Writes leaderboards/learning/flights.json, and from it flights.md and flights.png;
+what these say of other plants stays.
 """
 
 import argparse
@@ -137,10 +137,10 @@ def curve_of(budgets, drawn, points):
     }  # fmt: skip
 
 
-def measured(plant_id, gaps, work):
+def measured(plant_id, budget, gaps, work):
     """The curves of a plant, one per condition; those of the gaps with the reference."""
     plant, flown = load_plant(plant_id), {}
-    recipe = residual_recipe(plant)
+    recipe = residual_recipe(plant, budget)
     budgets = [recipe.flights >> i for i in reversed(range(HALVINGS + 1))]
     runs = [trained(plant, n, work, flown) for n in reversed(budgets)][::-1]
     found = {}
@@ -217,12 +217,13 @@ def page(every):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("plant")
+    parser.add_argument("--budget", type=int, help="largest number of training flights per condition")
     parser.add_argument("--gaps", nargs="+", choices=POINTS, default=list(POINTS), help="conditions with the reference")
     parser.add_argument("--work", type=Path, default=Path("runs"))
     arguments = parser.parse_args()
     file = HOME / "flights.json"
     every = json.loads(file.read_text()) if file.exists() else {}
-    every[arguments.plant] = measured(arguments.plant, arguments.gaps, arguments.work)
+    every[arguments.plant] = measured(arguments.plant, arguments.budget, arguments.gaps, arguments.work)
     write_whole(file, (json.dumps(dict(sorted(every.items())), indent=1) + "\n").encode())
     write_whole(HOME / "flights.md", page(every).encode())
     picture(every, HOME / "flights.png")
