@@ -41,15 +41,16 @@ FLAT, FAR = 0.5, 10  # points a doubling that are as good as none; doublings bey
 HOME = Path(__file__).parent.parent / "leaderboards" / "learning"
 INTRODUCTION = """# How many flights more
 
-Written by `python benchmarks/flights.py PLANT`. `residual_net` with an eighth, a quarter, a half and all of the training
-flights of its recipe, passes over each and all else the same, one seed. Balanced accuracy per sample in percent, on the same
-validation flights for all, and that of `onset_bank`, which is told the plant's equations and the process: on most suites
-[the best that is known to be attained](../attainable.md). Gaps to it are paired, with 95 % intervals over flights;
-[another seed of training](seeds.md) moves a score, too.
+Written by `python benchmarks/flights.py PLANT`. `residual_net` with ever more training flights, passes over each and all
+else the same, one seed. Balanced accuracy per sample in percent, on the same validation flights for all, and that of
+`onset_bank`, which is told the plant's equations and the process: on most suites [the best that is known to be
+attained](../attainable.md). Gaps to it are paired, with 95 % intervals over flights; [another seed of training](seeds.md)
+moves a score, too.
 
 "A doubling" is the slope of the score over the logarithm of the flights, of the three largest budgets. Where it is surely
 above 0, the line is drawn on to a gap of 3 points on the hard process and 1 elsewhere: so many flights per process it takes
-if the score goes on rising as it did. Curves bend, so these are the fewest.
+if the score goes on rising as it did. Curves bend, so these are the fewest. Where it is not, nothing can be told, and the
+curve is called flat where a doubling gives less than half a point.
 
 ![Score over training flights](flights.png)
 """
