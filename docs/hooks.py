@@ -58,6 +58,7 @@ def on_config(config: Any) -> Any:
         "@suites": ["suites/index.md", *({name: f"suites/{name}.md"} for name in suite_names())],
         "@boards": ["boards/README.md", {"Grid of methods and plants": "boards/grid.md"},
                     {"Learned": "boards/learning/README.md"}, {"Seeds of training": "boards/learning/seeds.md"},
+                    {"Flights of training": "boards/learning/flights.md"},
                     {"What can be attained": "boards/attainable.md"},
                     {"Coverage of the intervals": "boards/coverage.md"},
                     {"Bounds with probes": "boards/acting-bounds.md"}, {"Sensors": "boards/sensors.md"},

@@ -18,7 +18,17 @@ from conftest import PLANTS, build
 from numpy.testing import assert_allclose
 from safetensors.numpy import load_file, save_file
 
-from baselines.learned import _attention, attention, features, flights, probabilities, recipes, sequence_net, weights
+from baselines.learned import (
+    _attention,
+    attention,
+    features,
+    flights,
+    probabilities,
+    recipes,
+    sequence_net,
+    streams,
+    weights,
+)
 from baselines.learned._network import SequenceNetwork, loss
 from baselines.learned._supervised import SupervisedTraining
 from baselines.learned.features import FeatureShape
@@ -74,22 +84,45 @@ def tiny(tmp_path_factory):
 # The network sees a stream as it saw whole flights
 
 
-@pytest.mark.parametrize("shape", [FeatureShape(4, 3, 1), FeatureShape(5, 2, 2, 2, 3)], ids=["linear", "products"])
+SHAPES = {"linear": FeatureShape(4, 3, 1, shares=True), "products": FeatureShape(5, 2, 2, 2, 3)}
+
+
+def streamed(plant, shape, model, obs):
+    """The features of samples one by one, and the state after them."""
+    stream, seen = streams.begin(plant, shape, len(obs)), []
+    for k in range(obs.shape[1]):
+        stream, found = streams.add(plant, shape, model, stream, obs[:, k], k)
+        seen += [] if found is None else [found]
+    return np.stack(seen, axis=1), stream
+
+
+@pytest.mark.parametrize("shares", [False, True])
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 @pytest.mark.parametrize("plant_id", ["B747Lateral", "MissilePitch"])
-def test_features_of_a_stream_are_those_of_the_whole_flight(plant_id, shape):
-    plant = build(plant_id)
+def test_features_of_a_stream_are_those_of_the_whole_flight(plant_id, shape, shares):
+    """With gaps too, which change nothing before them, nor in other flights."""
+    plant, shape = build(plant_id), shape._replace(shares=shares)
     record = flights.fly(plant, Condition("standard", {}), range(TRAINING, TRAINING + 4))
-    z = features.blocks(plant, record.obs, shape.stride)
+    z, n_y = features.blocks(plant, record.obs, shape.stride), len(plant.outputs)
     delta = flights.at_steps(features.deviation(plant, record.target), shape.stride)[:, : z.shape[1]]
     model = features.identify(plant, shape, [(z, delta)])
-    model = features.standardised(plant, shape, model, z)
+    model = streams.standardised(plant, shape, model, [record.obs])
     assert {f"model.{k}": a.shape for k, a in model._asdict().items()} == features.tensor_shapes(plant, shape)
-    whole = features.features(plant, shape, model, z)
-    stream, seen = features.begin(plant, shape, 4), []
-    for k in range(record.obs.shape[1]):
-        stream, found = features.add(plant, shape, model, stream, record.obs[:, k], k)
-        seen += [] if found is None else [found]
-    assert np.allclose(np.stack(seen, axis=1), whole, atol=1e-5)
+    whole = streams.features(plant, shape, model, record.obs)
+    assert np.allclose(streamed(plant, shape, model, record.obs)[0], whole, atol=1e-5)
+    first = 8 * shape.period
+    gaps = record.obs.copy()
+    gaps[:2, first:, :n_y][np.random.default_rng(0).random(gaps[:2, first:, :n_y].shape) < 0.3] = np.nan
+    gaps[0, first : first + 40, 0] = np.nan
+    torn = streams.features(plant, shape, model, gaps)
+    assert np.array_equal(streamed(plant, shape, model, gaps)[0].astype(np.float32), torn)
+    assert np.isfinite(torn).all()
+    assert np.allclose(torn[2:], whole[2:], atol=1e-5)
+    assert np.allclose(torn[:, :8], whole[:, :8], atol=1e-5)
+    if shares:
+        there = ~np.isnan(gaps[:, : torn.shape[1] * shape.period, :n_y])
+        came = there.reshape(len(gaps), torn.shape[1], shape.period, n_y).mean(axis=2)
+        assert_allclose(torn[..., -n_y:] * model.std[-n_y:] + model.mean[-n_y:], came, atol=1e-6)
 
 
 def test_identified_residuals_are_white_where_the_plant_is_linear_and_healthy():
@@ -97,15 +130,17 @@ def test_identified_residuals_are_white_where_the_plant_is_linear_and_healthy():
     record = flights.fly(plant, Condition("fault-free", {}), range(TRAINING, TRAINING + 40))
     z = features.blocks(plant, record.obs, 1)
     model = features.identify(plant, shape, [(z, np.zeros((*z.shape[:2], 4)))])
-    phi, psi = features._sequences(plant, shape, z)
+    phi, psi = features.sequences(plant, shape, z)
     e, _, _ = features.information(model, phi, psi, z[:, 20:, 0, :4])
     assert np.allclose(np.cov(e.reshape(-1, 4).T), np.eye(4), atol=0.05)
     assert abs(np.mean(e[:, 1:] * e[:, :-1])) < 0.02
 
 
+@pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("plant_id", PLANTS)
-def test_a_sensor_that_does_not_report_says_nothing(plant_id):
-    plant, shape = build(plant_id), FeatureShape(stride=4, lags=3, degree=1)
+def test_a_sensor_that_does_not_report_says_nothing(plant_id, degree):
+    """A linear model says what is expected in its place; one with products what was reported last."""
+    plant, shape = build(plant_id), FeatureShape(stride=4, lags=3, degree=degree)
     record = flights.fly(plant, Condition("standard", {}), range(TRAINING, TRAINING + 6))
     obs, n_y = record.obs[:, :200].copy(), len(plant.outputs)
     z = features.blocks(plant, obs, shape.stride)
@@ -113,10 +148,7 @@ def test_a_sensor_that_does_not_report_says_nothing(plant_id):
     model = features.identify(plant, shape, [(z, delta)])
 
     def after(obs, samples):
-        stream = features.begin(plant, shape, len(obs))
-        for k in range(samples):
-            stream, _ = features.add(plant, shape, model, stream, obs[:, k], k)
-        return stream
+        return streamed(plant, shape, model, obs[:, :samples])[1]
 
     before = after(obs, 100)
     obs[:, 100:104, :n_y] = np.nan  # a whole block
@@ -125,15 +157,38 @@ def test_a_sensor_that_does_not_report_says_nothing(plant_id):
     assert_allclose(silent.g, keep * before.g)  # forgotten, and nothing new
     assert_allclose(silent.info, keep[..., None] * before.info)
     phi, _ = features.regressors(plant, shape, before.past, silent.past[:, 0])
-    assert_allclose(silent.past[:, 0, 0, :n_y], features.expected(model, phi))
+    ahead = features.expected(model, phi) if shape.linear else before.past[:, 0, 1, :n_y]
+    assert_allclose(silent.past[:, 0, 0, :n_y], ahead)
+    assert_allclose(silent.past[:, 0, 1, :n_y], ahead)
     obs = record.obs[:, :104].copy()
     obs[:, 103, 0] = np.nan  # the last of a block, of one sensor
     part, whole = after(obs, 104), after(record.obs, 104)
-    slope = (features.expected(model, phi)[:, 0] - before.past[:, 0, 1, 0]) / 2.5
+    slope = (ahead[:, 0] - before.past[:, 0, 1, 0]) / 2.5
     rest = plant.scale(obs)[:, 100:103, 0]
     assert_allclose(part.past[:, 0, 0, 0], rest.mean(axis=1) + 0.5 * slope)
     assert_allclose(part.past[:, 0, 1, 0], rest[:, -1] + slope)
     assert_allclose(part.past[:, 0, :, 1:], whole.past[:, 0, :, 1:])
+
+
+def test_where_a_model_has_products_residuals_after_a_gap_count_the_less_the_larger_they_are():
+    plant, shape = build("MissilePitch"), FeatureShape(stride=2, lags=4, degree=2)
+    record = flights.fly(plant, Condition("standard", {}), range(TRAINING, TRAINING + 6))
+    z = features.blocks(plant, record.obs, shape.stride)
+    delta = flights.at_steps(features.deviation(plant, record.target), shape.stride)[:, : z.shape[1]]
+    model = features.identify(plant, shape, [(z, delta)])
+    spread = np.sqrt(np.diag(np.linalg.inv(model.whiten.astype(float) @ model.whiten)))
+    assert_allclose(streams._trust(model, np.array([[0.5, -30.0, 0.0]]) * spread), [[1.0, streams.BOUND / 30, 1.0]])
+    obs = record.obs[:, :282].copy()
+    obs[:, 240:280, 0] = np.nan
+    silent, after = (streamed(plant, shape, model, obs[:, :k])[1] for k in (280, 282))
+    assert (after.torn == [False, True, True, True]).all()
+    last = plant.scale(obs)[:, 239, :1]
+    assert_allclose(silent.past[:, 0, :, 0], np.concatenate([last, last], axis=1))
+    bound = np.abs(model.whiten) @ (streams.BOUND * spread)
+    phi, _ = features.regressors(plant, shape, silent.past, after.past[:, 0])
+    plain = (after.past[:, 0, 0, :3] - features.expected(model, phi)) @ model.whiten.T
+    assert (np.abs(plain) > bound).any()
+    assert (np.abs(after.residuals - silent.residuals) <= bound).all()
 
 
 @pytest.mark.parametrize("path", NETWORKS, ids=lambda p: p.stem)
@@ -145,7 +200,7 @@ def test_streamed_diagnoses_are_those_of_the_whole_sequence(path):
     shape, model = weights.shape_of(path, card)[0], weights.model_of(tensors)
     record = flights.fly(plant, condition, range(VALIDATION, VALIDATION + 3))
     obs = record.obs[:, : 20 * shape.period + 3]
-    seen = [features.features(plant, shape, model, features.blocks(plant, obs, shape.stride))]
+    seen = [streams.features(plant, shape, model, obs)]
     seen.append(flights.context(np.zeros(3, int), len(card.processes), 20))
     told = flights.filters_features(plant, condition, card.filters, obs, shape.period)
     x = torch.from_numpy(np.concatenate([*seen, *told], axis=2)).double()
@@ -274,6 +329,28 @@ def test_a_network_is_told_the_process_and_takes_an_unknown_one_for_the_first(ti
         make_diagnoser("sequence_net", plant, path=str(tiny), process="no such")
 
 
+def test_a_network_that_has_learned_of_gaps_is_told_of_them_and_others_are_not(tiny, tmp_path):
+    """One with products is held where it has not."""
+    plant, missing = (build("B747Lateral", **options) for options in ({}, recipes.DROPOUT))
+    further = (*TINY.conditions, Condition("standard", recipes.DROPOUT))
+    shape = FeatureShape(20, 3, 2, shares=True)
+    path = trained(tmp_path, dataclasses.replace(TINY, conditions=further, shape=shape))
+    card, old = weights.read_card(path), weights.read_card(tiny)
+    assert card.processes == ["standard", "hard", "standard-dropout"]
+    assert [card.condition(p, "standard") for p in (plant, missing)] == ["standard", "standard-dropout"]
+    assert [card.condition(p, "hard") for p in (plant, missing)] == ["hard", "hard"]
+    assert old.condition(missing, "standard") == "standard"
+    obs = flights.fly(missing, further[0], range(VALIDATION, VALIDATION + 2)).obs[:, :200]
+    assert np.isnan(obs).any()
+    told, other = (make_diagnoser("sequence_net", p, path=str(path)) for p in (missing, plant))
+    assert told.gaps
+    assert other.gaps
+    assert not np.allclose(run(told, obs).label_probs, run(other, obs).label_probs)
+    assert np.isfinite(run(told, obs).label_probs).all()
+    deaf = dataclasses.replace(TINY, shape=shape._replace(shares=False))
+    assert not make_diagnoser("sequence_net", missing, path=str(trained(tmp_path / "deaf", deaf))).gaps
+
+
 @pytest.mark.parametrize("stop", [1, 3])
 def test_a_resumed_run_ends_with_the_same_bytes(tiny, tmp_path, stop):
     trained(tmp_path, stop_after=stop)
@@ -373,6 +450,19 @@ def test_learned_methods_see_through_gaps_or_are_held_and_their_entry_says_so(na
             assert stands if not diagnoser.gaps else field == "label" or not stands, field
             assert np.array_equal(value[1], plain[1]), field
             assert np.isfinite(value).all(), field
+
+
+@pytest.mark.parametrize("path", [p for p in NETWORKS if "residual_net" not in p.stem], ids=lambda p: p.stem)
+def test_shipped_networks_go_on_through_gaps_where_their_model_is_linear_or_they_have_learned_to(path):
+    card = weights.read_card(path)
+    plant = load_plant(card.plant, **{**card.options[0], **recipes.DROPOUT})
+    diagnoser = make_diagnoser(card.method, plant, process=card.processes[0])
+    shape = weights.shape_of(path, card)[0]
+    assert diagnoser.gaps == (shape.linear or shape.shares)
+    assert shape.shares == any(name.endswith(weights.MISSING) for name in card.processes)
+    obs = flights.fly(plant, Condition(card.processes[0], card.options[0]), range(VALIDATION, VALIDATION + 2)).obs[:, :200]
+    assert np.isnan(obs).any()
+    assert np.isfinite(run(diagnoser, obs).label_probs).all()
 
 
 def test_calibration_recovers_a_temperature_and_improves_the_log_score():
@@ -500,6 +590,7 @@ def test_a_card_that_does_not_fit_is_refused(tiny, tmp_path):
     shape = weights.read_card(tiny).shape
     for edit, reason in [
         ({"shape": {**shape, "hidden": "16"}}, "hidden is a whole number above 0, up to 1024, not '16'"),
+        ({"shape": {**shape, "shares": 1}}, "the shape's shares is true or false, not '1'"),
         (
             {"shape": {k: v for k, v in shape.items() if k != "lags"}},
             "the shape's lags is .*, not 'None'",
@@ -538,8 +629,12 @@ def test_without_weights_or_a_library_the_reason_is_given(monkeypatch, tmp_path)
 @pytest.mark.parametrize("plant_id", PLANTS)
 def test_recipes_name_what_exists(plant_id, sensor_faults):
     plant = build(plant_id, sensor_faults=sensor_faults)
-    for condition in recipes.sequence_recipe(plant).conditions:
+    recipe = recipes.network_recipe(plant)
+    for condition in recipe.conditions:
         assert condition.process in flights.plant_under(plant, condition).processes
+    names = [condition.name for condition in recipe.conditions]
+    assert len(set(names)) == len(names)
+    assert recipe.shape.shares == any(name.endswith(weights.MISSING) for name in names) == (not sensor_faults)
     for name in recipes.residual_recipe(plant).filters:
         assert not find_diagnoser(name).clairvoyant
 

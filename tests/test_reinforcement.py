@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
-from baselines.learned import features, weights
+from baselines.learned import streams, weights
 from baselines.learned._reinforcement import PolicyTraining
 from baselines.learned.adapters import from_sb3, from_torch
 from baselines.learned.feature_env import IdentifiedFeatures
@@ -131,7 +131,7 @@ def test_features_are_those_of_each_flight_alone(seen, units):
         """The features of the flight that environment i is on, with those before the first step: (T + 1, n_features)."""
         record = simulate(plant, [envs.unwrapped.scenarios[i]])
         obs = record.obs[:, : int(record.length[0]) + 1]
-        steps = features.features(plant, shape, model, features.blocks(plant, obs, shape.stride))[0]
+        steps = streams.features(plant, shape, model, obs)[0]
         return np.concatenate([np.zeros_like(steps[:1]), steps])
 
     obs, _ = envs.reset(seed=VALIDATION)

@@ -176,7 +176,7 @@ class SupervisedTraining(Training[SequenceRecipe]):
         found, declared = {}, self.logits(flown).argmax(axis=2)
         for i, (plant, condition, record) in enumerate(zip(self.plants, self.recipe.conditions, records, strict=True)):
             label = data.at_samples(declared[flown.process == i], self.recipe.shape.period, record.label.shape[1])
-            found[condition.process] = data.accuracy(plant, condition, record, label)
+            found[condition.name] = data.accuracy(plant, condition, record, label)
         return found
 
     # -- the end
@@ -196,7 +196,7 @@ class SupervisedTraining(Training[SequenceRecipe]):
                 (function(plain, label), function(better, label))
                 for function in (probabilities.log_score, probabilities.calibration_error)
             )
-            found[condition.process] = weights.ProbabilityCalibration(
+            found[condition.name] = weights.ProbabilityCalibration(
                 scale=scale, bias=bias.tolist(), prior=prior.tolist(), log_score=scores, calibration_error=errors
             )
         return found

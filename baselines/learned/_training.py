@@ -180,7 +180,7 @@ class Training(ABC, Generic[R]):
         cut = {"windows": [c.windows for c in r.conditions], "paces": [c.pace for c in r.conditions]}
         card = weights.Card(
             method=self.method, env=self.plant.env_id, plant=self.plant.id,
-            options=[dict(plant.options) for plant in self.plants], processes=[c.process for c in r.conditions],
+            options=[dict(plant.options) for plant in self.plants], processes=[c.name for c in r.conditions],
             **weights.names(self.plant), mismatch=max(c.mismatch for c in r.conditions),  # type: ignore[arg-type]
             shape=own.pop("shape", {**r.shape._asdict(), "hidden": r.hidden}), seeds=seeds | own.pop("seeds", {}),
             budget={**own.pop("budget"), "seconds": round(self.seconds, 1)},

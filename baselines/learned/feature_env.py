@@ -9,15 +9,16 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from baselines.learned import features as feat
-from baselines.learned.features import FeatureModel, FeatureShape, Stream
+from baselines.learned import streams
+from baselines.learned.features import FeatureModel, FeatureShape
+from baselines.learned.streams import Stream
 from fdi_gym.plant import Array, Plant
 
 
 class IdentifiedFeatures(VectorWrapper):
     """Shows the features (N, n_features), float32, of the last step of `shape.period` samples that is complete.
 
-    They are those of `features.add`, fed with the samples of each episode alone. After j decisions the newest
+    They are those of `streams.add`, fed with the samples of each episode alone. After j decisions the newest
     sample is j * period, so the last complete step ended one sample before; at an episode's beginning, before the first,
     the features are 0, their mean. All environments are at the same place of their steps, also where an episode begins
     anew while others go on.
@@ -48,7 +49,7 @@ class IdentifiedFeatures(VectorWrapper):
         scaled = space.dtype == np.float32
         self._scale = np.array([s.scale if scaled else 1.0 for s in plant.observed])
         self._offset = np.array([s.nominal if scaled else 0.0 for s in plant.observed])
-        self._fresh = feat.begin(plant, shape, env.num_envs)
+        self._fresh = streams.begin(plant, shape, env.num_envs)
         self._stream, self._shown = self._fresh, np.zeros((env.num_envs, *model.mean.shape), np.float32)
         self._k = np.zeros(env.num_envs, np.int64)  # newest sample of each episode
 
@@ -97,7 +98,7 @@ class IdentifiedFeatures(VectorWrapper):
         """Feed the newest period of samples (N, m, n_obs) after the first; the features of the step that it completes."""
         shown, model = None, (self._plant, self._shape, self._model)
         for k in range(1, self._shape.period + 1):
-            self._stream, seen = feat.add(*model, self._stream, self._physical(block[:, k - 1]), k)
+            self._stream, seen = streams.add(*model, self._stream, self._physical(block[:, k - 1]), k)
             shown = seen if seen is not None else shown
         assert shown is not None
         return shown.astype(np.float32)
@@ -105,7 +106,7 @@ class IdentifiedFeatures(VectorWrapper):
     def _begin(self, begun: Array, block: Array) -> None:
         """Set the episodes that begin back to their first sample, which is all of their block."""
         obs = self._physical(block[:, -1])
-        first, _ = feat.add(self._plant, self._shape, self._model, self._fresh, obs, 0)
+        first, _ = streams.add(self._plant, self._shape, self._model, self._fresh, obs, 0)
         mixed = (np.where(begun.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(first, self._stream, strict=True))
         self._stream = Stream(*mixed)
         self._shown = np.where(begun[:, None], np.float32(0), self._shown)

@@ -11,11 +11,7 @@ quantity from healthy and psi_k made of the outputs, the commands, what else is 
 then shown as its blocks, its whitened residuals e = R^(-1/2) (y - W phi), and the regularised recursive least-squares
 estimates of delta with several memories, from exponentially forgotten sums of S'e and S'S, S = R^(-1/2) [V_j psi]. All
 of it is causal, and nothing of it knows the plant's equations: it is learned from the observations and labels of
-training flights.
-
-An output that did not report in a part of a block has the mean and the newest of its reports, moved along the slope that the
-model expects to where they stand for; one that did not report at all has what the model expects, without effect on the
-estimates; a command is what it was.
+training flights. `baselines.learned.streams` makes it of samples, one by one or of whole flights.
 """
 
 from __future__ import annotations
@@ -46,6 +42,7 @@ class FeatureShape(NamedTuple):
     degree: int
     effects: int = 1
     every: int = 1  # blocks per step of the network
+    shares: bool = False  # whether a step says which share of each output's reports came
 
     @property
     def period(self) -> int:
@@ -56,6 +53,10 @@ class FeatureShape(NamedTuple):
     def linear(self) -> bool:
         """Whether the model is: such a one runs on through a gap, one with products runs away."""
         return max(self.degree, self.effects) == 1
+
+    def width(self, observed: int, outputs: int, estimated: int) -> int:
+        """Features of a step, for so many channels, of which so many are outputs, and estimated entries."""
+        return 2 * observed + outputs * (2 if self.shares else 1) + len(MEMORIES) * (3 * estimated + 1)
 
 
 class FeatureModel(NamedTuple):
@@ -100,7 +101,7 @@ def regressors(plant: Plant, shape: FeatureShape, past: Array, now: Array) -> tu
     return np.concatenate(phi, axis=-1), np.concatenate([one, here, *products[: shape.effects - 1]], axis=-1)
 
 
-def _sequences(plant: Plant, shape: FeatureShape, z: Array) -> tuple[Array, Array]:
+def sequences(plant: Plant, shape: FeatureShape, z: Array) -> tuple[Array, Array]:
     """The regressors of the blocks lags, lags + 1, ... of whole flights z (N, T, 2, n_obs)."""
     p, T = shape.lags, z.shape[1]
     return regressors(plant, shape, np.stack([z[:, p - 1 - i : T - 1 - i] for i in range(p)], axis=2), z[:, p:])
@@ -109,13 +110,13 @@ def _sequences(plant: Plant, shape: FeatureShape, z: Array) -> tuple[Array, Arra
 def identify(plant: Plant, shape: FeatureShape, flights: Iterable[tuple[Array, Array]]) -> FeatureModel:
     """Fit the model to flights: pairs of blocks (N, T, 2, n_obs) and their deviations (N, T, n_estimated).
 
-    The features' mean and standard deviation are left at 0 and 1: `standardised` sets them.
+    The features' mean and standard deviation are left at 0 and 1: `streams.standardised` sets them.
     """
     n_y = len(plant.outputs)
     n_phi, n_psi, total = 0, 0, 0.0
     G: Any = 0.0
     for z, delta in flights:
-        phi, psi = _sequences(plant, shape, z)
+        phi, psi = sequences(plant, shape, z)
         n_phi, n_psi = phi.shape[-1], psi.shape[-1]
         effects = (delta[:, shape.lags :, :, None] * psi[:, :, None]).reshape(*psi.shape[:2], -1)
         rows = np.concatenate([phi, effects, z[:, shape.lags :, 0, :n_y]], axis=-1)
@@ -132,7 +133,7 @@ def identify(plant: Plant, shape: FeatureShape, flights: Iterable[tuple[Array, A
     power, directions = np.linalg.eigh(joint.T @ G @ joint)
     whiten = (directions / np.sqrt(np.maximum(power, 1e-12))) @ directions.T
     V = C[n_phi:].reshape(-1, n_psi, n_y).transpose(0, 2, 1)
-    width = 2 * len(plant.observed) + n_y + len(MEMORIES) * (3 * len(V) + 1)
+    width = shape.width(len(plant.observed), n_y, len(V))
     arrays = (C[:n_phi].T, V, whiten, np.zeros(width), np.ones(width))
     return FeatureModel(*(np.ascontiguousarray(a, np.float32) for a in arrays))
 
@@ -142,7 +143,7 @@ def tensor_shapes(plant: Plant, shape: FeatureShape) -> dict[str, tuple[int, ...
     n, n_y, p = len(plant.observed), len(plant.outputs), len(plant.estimated)
     sizes = [len(which) for which in _products(n + n_y, max(shape.degree, shape.effects))]
     n_phi, n_psi = 1 + 2 * shape.lags * n + n - n_y + sum(sizes[: shape.degree - 1]), 1 + n + sum(sizes[: shape.effects - 1])
-    width = 2 * n + n_y + len(MEMORIES) * (3 * p + 1)
+    width = shape.width(n, n_y, p)
     found = {"W": (n_y, n_phi), "V": (p, n_y, n_psi), "whiten": (n_y, n_y), "mean": (width,), "std": (width,)}
     return {f"model.{name}": value for name, value in found.items()}
 
@@ -153,21 +154,21 @@ def expected(model: FeatureModel, phi: Array) -> Array:
 
 
 def information(
-    model: FeatureModel, phi: Array, psi: Array, y: Array, heard: Array | None = None
+    model: FeatureModel, phi: Array, psi: Array, y: Array, trust: Array | None = None
 ) -> tuple[Array, Array, Array]:
     """Whitened residuals e (..., n_y), S'e (..., p) and S'S (..., p, p) of mean outputs y (..., n_y).
 
-    Outputs that were not heard (..., n_y) have no residual, and no fault shows in them.
+    Outputs are trusted (..., n_y) from 1 down to 0: such a one has no residual, and no fault shows in it.
     """
     r = y - expected(model, phi)
     e = r @ model.whiten.T.astype(float)
     S = psi @ np.einsum("ab,jbx->xaj", model.whiten, model.V).astype(float).reshape(psi.shape[-1], -1)
     S = S.reshape(*psi.shape[:-1], len(model.whiten), len(model.V))
-    if heard is not None and not heard.all():
-        some = ~heard.all(axis=-1)  # of the others nothing changes, whichever they are in a batch with
-        there = heard[some]
-        e[some] = (r[some] * there) @ model.whiten.T.astype(float)
-        S[some] = model.whiten @ (there[..., None] * np.einsum("jbx,...x->...bj", model.V, psi[some]))
+    if trust is not None and (trust < 1).any():
+        some = (trust < 1).any(axis=-1)  # of the others nothing changes, whichever they are in a batch with
+        less = trust[some]
+        e[some] = (r[some] * less) @ model.whiten.T.astype(float)
+        S[some] = model.whiten @ (less[..., None] * np.einsum("jbx,...x->...bj", model.V, psi[some]))
     St = np.swapaxes(S, -1, -2)
     return e, (St @ e[..., None])[..., 0], St @ S
 
@@ -182,118 +183,10 @@ def estimates(g: Array, info: Array) -> Array:
     return found.reshape(*found.shape[:-2], -1)
 
 
-def features(plant: Plant, shape: FeatureShape, model: FeatureModel, z: Array) -> Array:
-    """Whole flights z (N, T, 2, n_obs) as a network sees them (N, T // every, n_features), float32."""
-    import scipy.signal  # takes a second, and only training comes here
-
-    m, T = shape.every, z.shape[1] // shape.every * shape.every
-    z = z[:, :T]
-    phi, psi = _sequences(plant, shape, z)
-    known = information(model, phi, psi, z[:, shape.lags :, 0, : len(plant.outputs)])
-    e, g, info = (np.pad(a, [(0, 0), (T - a.shape[1], 0)] + [(0, 0)] * (a.ndim - 2)) for a in known)
-    keep = 1 - 1 / MEMORIES
-
-    def forgotten(part: Array) -> Array:
-        return np.stack(
-            [np.asarray(scipy.signal.lfilter([1.0], [1.0, -a], part, axis=1))[:, m - 1 :: m] for a in keep], axis=2
-        )
-
-    by_step = (len(z), T // m, m, -1)
-    mean, newest = z[:, :, 0].reshape(by_step).mean(axis=2), z[:, m - 1 :: m, 1]
-    return _assembled(shape, model, mean, newest, e.reshape(by_step).sum(axis=2), forgotten(g), forgotten(info)).astype(
-        np.float32
-    )
-
-
-def _assembled(
-    shape: FeatureShape, model: FeatureModel, mean: Array, newest: Array, e: Array, g: Array, info: Array
+def assembled(
+    shape: FeatureShape, model: FeatureModel, mean: Array, newest: Array, e: Array, g: Array, info: Array, shares: Array
 ) -> Array:  # fmt: skip
-    """The features of steps, from the means and newest samples, the sums of residuals, and the forgotten sums."""
+    """The features of steps, from the means and newest samples, the sums of residuals, the forgotten sums, and shares."""
     seen = [np.arcsinh(mean), np.arcsinh(newest), np.arcsinh(e / np.sqrt(shape.every)), estimates(g, info)]
+    seen += [shares] if shape.shares else []
     return (np.concatenate(seen, axis=-1) - model.mean) / model.std
-
-
-def standardised(plant: Plant, shape: FeatureShape, model: FeatureModel, z: Array) -> FeatureModel:
-    """The model with the features' mean and standard deviation over these flights."""
-    seen = features(plant, shape, model, z).reshape(-1, len(model.mean)).astype(float)
-    return model._replace(mean=np.float32(seen.mean(axis=0)), std=np.float32(seen.std(axis=0) + 1e-3))
-
-
-class Stream(NamedTuple):
-    """The state of a stream of samples for n episodes; `add` takes one sample each."""
-
-    count: Array  # (n, n_obs) reports in the block that is being filled,
-    total: Array  # (n, n_obs) their sum,
-    when: Array  # (n, n_obs) that of their places in the block, 1 to stride,
-    last: Array  # (n, n_obs) and the last of these places
-    newest: Array  # (n, n_obs) the last report of each channel
-    past: Array  # (n, lags, 2, n_obs), newest first
-    filled: Array  # (n,) blocks so far
-    g: Array  # (n, M, p)
-    info: Array  # (n, M, p, p)
-    blocks: Array  # (n,) blocks of the step that is being filled,
-    means: Array  # (n, n_obs) the sum of their means
-    residuals: Array  # (n, n_y) and of their residuals
-
-
-def begin(plant: Plant, shape: FeatureShape, n: int) -> Stream:
-    """The state before the first sample."""
-    p, M, width = len(plant.estimated), len(MEMORIES), len(plant.observed)
-    count, total, when, last, newest, means = np.zeros((6, n, width))
-    return Stream(
-        count=count, total=total, when=when, last=last, newest=newest, past=np.zeros((n, shape.lags, 2, width)),
-        filled=np.zeros(n, np.int64), g=np.zeros((n, M, p)), info=np.zeros((n, M, p, p)), blocks=np.zeros(n), means=means,
-        residuals=np.zeros((n, len(plant.outputs))),
-    )  # fmt: skip
-
-
-def add(
-    plant: Plant, shape: FeatureShape, model: FeatureModel, stream: Stream, obs: Array, k: int
-) -> tuple[Stream, Array | None]:  # fmt: skip
-    """Sample k (n, n_obs): the state after it and, at the end of a step, what `features` has there (n, n_features)."""
-    sample = plant.scale(obs)
-    there = ~np.isnan(sample)
-    place = k % shape.stride + 1.0
-    stream = stream._replace(
-        count=stream.count + there, total=stream.total + np.where(there, sample, 0.0), when=stream.when + place * there,
-        last=np.where(there, place, stream.last), newest=np.where(there, sample, stream.newest),
-    )  # fmt: skip
-    if (k + 1) % shape.stride:
-        return stream, None
-    stream = _close_block(plant, shape, model, stream)
-    if (k + 1) % shape.period:
-        return stream, None
-    means = stream.means / stream.blocks[:, None]
-    seen = _assembled(shape, model, means, stream.newest, stream.residuals, stream.g, stream.info)
-    zeros = (np.zeros_like(a) for a in (stream.blocks, stream.means, stream.residuals))
-    return stream._replace(**dict(zip(("blocks", "means", "residuals"), zeros, strict=True))), seen
-
-
-def _close_block(plant: Plant, shape: FeatureShape, model: FeatureModel, stream: Stream) -> Stream:
-    n_y, heard, middle = len(plant.outputs), stream.count > 0, (shape.stride + 1) / 2
-    mean = stream.total / np.maximum(stream.count, 1.0)
-    if not heard.all():
-        mean = np.where(heard, mean, stream.past[:, 0, 0])  # a command is what it was
-    now = np.stack([mean, stream.newest], axis=1)
-    phi, psi = regressors(plant, shape, stream.past, now)
-    part = stream.count[:, :n_y] < shape.stride
-    if part.any():
-        ahead = expected(model, phi)
-        slope = (ahead - stream.past[:, 0, 1, :n_y]) / middle  # per sample
-        early = middle - stream.when[:, :n_y] / np.maximum(stream.count[:, :n_y], 1.0)
-        for row, filled in (
-            (0, np.where(heard[:, :n_y], mean[:, :n_y] + slope * early, ahead)),
-            (1, np.where(heard[:, :n_y], stream.newest[:, :n_y] + slope * (shape.stride - stream.last[:, :n_y]), ahead)),
-        ):
-            now[:, row, :n_y] = np.where(part, filled, now[:, row, :n_y])
-    e, g, info = information(model, phi, psi, now[:, 0, :n_y], heard[:, :n_y])
-    ready = (stream.filled >= shape.lags).astype(float)
-    keep = (1 - 1 / MEMORIES)[:, None]
-    count, total, when, last = (np.zeros_like(stream.total) for _ in range(4))
-    return Stream(
-        count=count, total=total, when=when, last=last, newest=now[:, 1],
-        past=np.concatenate([now[:, None], stream.past[:, :-1]], axis=1), filled=stream.filled + 1,
-        g=keep * stream.g + (g * ready[:, None])[:, None],
-        info=keep[..., None] * stream.info + (info * ready[:, None, None])[:, None],
-        blocks=stream.blocks + 1, means=stream.means + now[:, 0], residuals=stream.residuals + e * ready[:, None],
-    )  # fmt: skip

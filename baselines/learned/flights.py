@@ -8,7 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from baselines.learned import features as feat
+from baselines.learned import streams
 from baselines.learned.features import FeatureModel, FeatureShape
+from baselines.learned.weights import MISSING
 from fdi_gym.diagnosis import Diagnosis, make_diagnoser, run
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import Record, simulate
@@ -31,6 +33,11 @@ class Condition(NamedTuple):
     mismatch: float = 0.0  # how far its parameters may be off
     windows: int = 1  # drawn flights whose faults follow one another in one, as in suites,
     pace: float = 1.0  # with their times multiplied by this
+
+    @property
+    def name(self) -> str:
+        """What a network is told to expect: the process, and whether samples will be missing."""
+        return self.process + (MISSING if self.options.get("dropout") else "")
 
     def seeds(self, flight: int) -> range:
         """The seeds of a flight of this number, which counts from the first seed of its split."""
@@ -70,16 +77,16 @@ def fly(plant: Plant, condition: Condition, seeds: Sequence[int]) -> Record:
 
 
 def identified(plants: Sequence[Plant], shape: FeatureShape, records: Sequence[Record]) -> FeatureModel:
-    """The model of a plant, identified from recorded flights of each of its variants; their truth is used."""
-    z = [feat.blocks(plant, record.obs, shape.stride) for plant, record in zip(plants, records, strict=True)]
+    """The model of a plant, from recorded flights of its variants whose sensors all report; their truth is used."""
+    reported = [(p, r) for p, r in zip(plants, records, strict=True) if p.regular is None]
+    z = [feat.blocks(plant, record.obs, shape.stride) for plant, record in reported]
     truth = [
         at_steps(feat.deviation(plant, record.target), shape.stride)[:, : b.shape[1]]
-        for plant, record, b in zip(plants, records, z, strict=True)
+        for (plant, record), b in zip(reported, z, strict=True)
     ]
     pairs = ((b[i : i + 50], d[i : i + 50]) for b, d in zip(z, truth, strict=True) for i in range(0, len(b), 50))
     model = feat.identify(plants[0], shape, pairs)
-    shortest = min(b.shape[1] for b in z)
-    return feat.standardised(plants[0], shape, model, np.concatenate([b[:40, :shortest] for b in z]))
+    return streams.standardised(plants[0], shape, model, [record.obs[:40] for record in records])
 
 
 def selected(plant: Plant, condition: Condition, candidates: Sequence[int], count: int) -> list[int]:
@@ -173,11 +180,10 @@ def prepare(
     """Fly the seeds under one of the conditions, whose plant it is, and show them as a network sees them."""
     condition = conditions[index]
     record = fly(plant, condition, seeds)
-    z = feat.blocks(plant, record.obs, shape.stride)
-    n, T = len(z), z.shape[1] // shape.every
+    n, T = len(record.obs), record.obs.shape[1] // shape.period
     process = np.full(n, index)
     pieces = np.array_split(np.arange(n), max(1, n // 50))
-    own = np.concatenate([feat.features(plant, shape, model, z[i]) for i in pieces])
+    own = np.concatenate([streams.features(plant, shape, model, record.obs[i]) for i in pieces])
     shown = [own, context(process, len(conditions), T)]
     if filters:
         import joblib

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from baselines.learned import features as feat
-from baselines.learned import weights
+from baselines.learned import streams, weights
 from baselines.learned.features import FeatureShape
 from fdi_gym.diagnosis import Diagnoser, Diagnosis
 from fdi_gym.plant import Array, Plant
@@ -50,7 +50,7 @@ def policy_diagnoser(plant: Plant, shape: FeatureShape, tensors: Mapping[str, Ar
     def init(n: int) -> Any:
         none = np.zeros(n, np.int64)
         first = Diagnosis(none > 0, none, label_probs=np.full((n, labels), 1 / labels))
-        return 0, feat.begin(plant, shape, n), first if isolates else Diagnosis(none > 0, none, np.tile(healthy, (n, 1)))
+        return 0, streams.begin(plant, shape, n), first if isolates else Diagnosis(none > 0, none, np.tile(healthy, (n, 1)))
 
     def decide(x: Array) -> Diagnosis:
         answer = actor(layers, x)
@@ -63,7 +63,7 @@ def policy_diagnoser(plant: Plant, shape: FeatureShape, tensors: Mapping[str, Ar
 
     def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
         k, stream, diagnosis = state
-        stream, features = feat.add(plant, shape, model, stream, obs, k)
+        stream, features = streams.add(plant, shape, model, stream, obs, k)
         diagnosis = diagnosis if features is None else decide(features)
         return (k + 1, stream, diagnosis), diagnosis
 

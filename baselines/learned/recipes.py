@@ -104,6 +104,8 @@ class PolicyRecipe(LegsRecipe):
 
 MISMATCH = 0.1  # of the plants that a network is trained on that is to bear it: that of the suites
 BOTH = (Condition("standard", {}), Condition("hard", {}))
+DROPOUT = {"dropout": 0.2, "burst": 10.0}  # of the suites
+FURTHER = ("gust",)  # processes beside the first two that a network is trained on, where a plant has them
 SEQUENCES = {
     "B747Lateral": SequenceRecipe(
         conditions=BOTH, shape=FeatureShape(stride=4, lags=12, degree=1), flights=6144, validate=16
@@ -122,10 +124,11 @@ SEQUENCES = {
     ),
 }  # fmt: skip
 FILTERS = {  # that residual_net is shown, and training flights per condition: filters cost more than networks
-    "B747Lateral": (("bayes_bank", "switching_bayes_bank"), 600),
+    "B747Lateral": (("onset_bank", "switching_bayes_bank"), 600),
     "HUAVHover": (("hypothesis_bank", "ascdkf"), 1000),
-    "MissilePitch": (("augmented_ekf_imm", "augmented_ekf_mode_probabilities"), 600),
+    "MissilePitch": (("augmented_ekf_imm", "augmented_ekf_mode_probabilities"), 400),
     "CMGSatellite": (("mekf",), 400),
+    "ThreeTank": (("augmented_ekf", "multiple_model_ekf"), 600),
 }
 # fault windows in a flight that networks are shown, and their pace: whole flights are long, and its suites are so too
 WINDOWS = {"CMGSatellite": {"standard": (3, 0.2), "mixed": (3, 0.1)}}
@@ -161,13 +164,21 @@ def sequence_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
 
 
 def network_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
-    """The recipe of the recurrent network: where whole flights are long, several windows of faults in a shorter one.
+    """The recipe of the recurrent network: with more processes, and with samples that go missing.
+
+    Where whole flights are long, it is shown several windows of faults in a shorter one. Where sensors fail there is the one
+    process.
 
     Args:
         plant: The plant.
         budget: Training flights per condition, in place of the recipe's.
     """
     found, cut = sequence_recipe(plant, budget), WINDOWS.get(plant.id, {})
+    if plant.bare is None:
+        first = found.conditions[0]
+        missing = first._replace(options={**first.options, **DROPOUT})
+        further = (first._replace(process=name) for name in FURTHER if name in plant.processes)
+        found = replace(found, conditions=(*found.conditions, missing, *further), shape=found.shape._replace(shares=True))
     windowed = [c if c.process not in cut else c._replace(windows=cut[c.process][0], pace=cut[c.process][1])
                 for c in found.conditions]  # fmt: skip
     return replace(found, conditions=tuple(windowed))

@@ -7,8 +7,8 @@ answer holds until the next. It was trained with labels of equal weight, so its 
 accuracy asks for: that is the label it declares. The probabilities are calibrated for the process it expects (scale, bias
 per label), so the most probable label may be another where a label is rare.
 
-It is told which fault process to expect, as the filters are; one that it was not trained on it takes for the first. It runs
-on NumPy; torch trains it (`baselines.learned._supervised`).
+It is told which fault process to expect, as the filters are, and whether samples will be missing; a process that it was not
+trained on it takes for the first. It runs on NumPy; torch trains it (`baselines.learned._supervised`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from baselines.learned import attention, weights
+from baselines.learned import attention, streams, weights
 from baselines.learned import features as feat
 from baselines.learned.flights import filter_features
 from baselines.learned.probabilities import log_softmax
@@ -68,8 +68,9 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
     weights.check_tensors(file, tensors, tensor_shapes(plant, shape, hidden, told, len(card.processes), method))
     model = weights.model_of(tensors)
     net = {name.removeprefix("network."): value.astype(float) for name, value in tensors.items()}
-    context = np.eye(len(card.processes))[card.processes.index(expected)]
-    calibration = weights.calibration_of(file, card, expected)
+    condition = card.condition(plant, expected)
+    context = np.eye(len(card.processes))[card.processes.index(condition)]
+    calibration = weights.calibration_of(file, card, condition)
     scale, bias, prior = calibration.scale, np.array(calibration.bias), np.array(calibration.prior)
     healthy = plant.healthy
     unit = np.array([s.scale for s in plant.estimated])
@@ -78,7 +79,7 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
         first = Diagnosis(np.zeros(n, bool), np.zeros(n, np.int64), np.tile(healthy, (n, 1)), np.tile(unit, (n, 1)),
                           np.tile(prior / prior.sum(), (n, 1)))  # fmt: skip
         h = attention.begin(n, hidden) if method == ATTENTION else np.zeros((n, hidden))
-        return 0, feat.begin(plant, shape, n), h, [f.init(n) for f in filters], first
+        return 0, streams.begin(plant, shape, n), h, [f.init(n) for f in filters], first
 
     def answer(x: Array, h: Any) -> tuple[Any, Diagnosis]:
         logits, mean, log_std, h = forward(net, x, h, len(plant.labels), len(context))
@@ -88,14 +89,14 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
 
     def update(state: Any, obs: Array) -> tuple[Any, Diagnosis]:
         k, stream, h, inner, diagnosis = state
-        stream, features = feat.add(plant, shape, model, stream, obs, k)
+        stream, features = streams.add(plant, shape, model, stream, obs, k)
         further = [f.update(own, obs) for f, own in zip(filters, inner, strict=True)]
         if features is not None:
             parts = [features, np.tile(context, (len(obs), 1)), *(filter_features(plant, own) for _, own in further)]
             h, diagnosis = answer(np.concatenate(parts, axis=1), h)
         return (k + 1, stream, h, [own for own, _ in further], diagnosis), diagnosis
 
-    return Diagnoser(init, update, gaps=shape.linear and all(f.gaps for f in filters))
+    return Diagnoser(init, update, gaps=(shape.linear or shape.shares) and all(f.gaps for f in filters))
 
 
 @trainer("sequence_net", "Recurrent network on observations, supervised")

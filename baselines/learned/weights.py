@@ -29,6 +29,7 @@ WEIGHTS = Path(__file__).parent / "weights"
 # upper ends of what a card may ask for, so that no card makes the building of a network take all memory
 SIZES = {"stride": 1000, "lags": 1000, "degree": 3, "effects": 3, "every": 1000, "hidden": 1024}
 LARGEST, LARGEST_CARD = 2**28, 2**20  # bytes
+MISSING = "-dropout"  # ends the name of a process whose samples go missing
 
 
 class ProbabilityCalibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -64,7 +65,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         env: Environment id, with its version; weights of another version are refused.
         plant: Plant id.
         options: Options of the plant, one dict per process that they were trained on.
-        processes: The fault processes, in the order in which the network is told of them.
+        processes: The fault processes, in the order in which the network is told of them: names of `flights.Condition`.
         labels, observed, estimated: Names, in order.
         task: "isolation", "identification" or "both".
         shape: What the network is made of.
@@ -111,6 +112,11 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     def expected(self, process: str) -> str:
         """The process that a method expects which is told this one: that, or the first where it was not trained on it."""
         return process if process in self.processes else self.processes[0]
+
+    def condition(self, plant: Plant, process: str) -> str:
+        """What it is told that expects this process: also that samples go missing, where it was trained on that."""
+        missing = process + MISSING
+        return missing if plant.regular is not None and missing in self.processes else process
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.processes) <= 100 or len(set(self.processes)) < len(self.processes):
@@ -192,7 +198,7 @@ def deliver(
     found = Card(
         method=method, env=plant.env_id, plant=plant.id,
         options=[dict(plant_under(plant, c).options) for c in recipe.conditions],
-        processes=[c.process for c in recipe.conditions], **names(plant),  # type: ignore[arg-type]
+        processes=[c.name for c in recipe.conditions], **names(plant),  # type: ignore[arg-type]
         seeds=seeds | card.pop("seeds", {}), command=command, revision=revision, versions=versions, **card,
     )  # fmt: skip
     path = work / f"{stem(method, plant)}-{seed}" / f"{stem(method, plant)}.safetensors"
@@ -298,13 +304,15 @@ def shape_of(path: Path, card: Card) -> tuple[FeatureShape, int]:
     """The shape of the identified model and the width of the layers, as the card gives them.
 
     Raises:
-        RefusedError: One is missing, or not a whole number above 0 and up to its upper end.
+        RefusedError: One is missing, or not a whole number above 0 and up to its upper end, or not true or false.
     """
     defaults = {**FeatureShape._field_defaults, **card.shape}
     card = msgspec.structs.replace(card, shape=defaults)
-    sizes = {name: whole_number(path, card, name, SIZES[name]) for name in (*FeatureShape._fields, "hidden")}
+    if type(shares := defaults["shares"]) is not bool:
+        raise RefusedError(f"{path.with_suffix('.json')}: the shape's shares is true or false, not {str(shares)[:80]!r}")
+    sizes = {name: whole_number(path, card, name, most) for name, most in SIZES.items()}
     hidden = sizes.pop("hidden")
-    return FeatureShape(**sizes), hidden
+    return FeatureShape(**sizes, shares=shares), hidden
 
 
 def whole_number(path: Path, card: Card, name: str, most: int) -> int:
