@@ -1,10 +1,10 @@
 """What a method can attain that is told nothing of the truth: Bayes' rule over the process, refined until it stands still.
 
-    python benchmarks/attainable.py [SUITE ...] [--flights 100] [--page leaderboards/attainable.md]
+    python benchmarks/attainable.py [SUITE ...] [--decisions 10] [--page leaderboards/attainable.md]
     python benchmarks/attainable.py --page-only
 
-The suites named are flown with fresh seeds; sections of others that the page has stay there. The table of all suites is
-made of the rows in leaderboards/results.
+The suites named are flown with fresh seeds, so many decisions of each label; sections of others that the page has stay
+there. The table of all suites is made of the rows in leaderboards/results.
 """
 
 import argparse
@@ -15,9 +15,9 @@ from pathlib import Path
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[name] = "1"
 
-import msgspec
 from sections import sections_of, write_sections
 
+from fdi_gym.design import by_label
 from fdi_gym.diagnosis import NotApplicableError, make_diagnoser, run
 from fdi_gym.leaderboard import boards
 from fdi_gym.metrics import outcome
@@ -66,13 +66,12 @@ def method_for(plant, process):
     raise SystemExit(f"none of {', '.join(SETTINGS)} can run on {plant.id}")
 
 
-def refined(suite, name, count):
-    """A row for each setting of a method: of fresh flights of a suite's kind."""
-    fresh = msgspec.structs.replace(suite, seeds=[FIRST + i for i in range(count * suite.windows)], healthy=[])
-    plant = suite.build()
+def refined(fresh, name):
+    """A row for each setting of a method: of the flights of a suite."""
+    plant = fresh.build()
     record = fresh.record(plant, range(fresh.episodes))
     for settings in SETTINGS[name]:
-        found, spent = score(name, plant, suite.process, record, **settings)
+        found, spent = score(name, plant, fresh.process, record, **settings)
         told = ", ".join(f"{key} {value}" for key, value in settings.items()) or "as it is"
         yield [told, *(f"{100 * found[kind]['balanced_accuracy']:.1f}" for kind in ("per_sample", "per_decision")),
                f"{found['log_score']:.3f}", f"{spent:.0f}"]  # fmt: skip
@@ -102,7 +101,7 @@ def brackets(results):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("suites", nargs="*", default=SUITES)
-    parser.add_argument("--flights", type=int, default=100)
+    parser.add_argument("--decisions", type=int, default=10, help="of each label")
     parser.add_argument("--results", type=Path, default=Path("leaderboards/results"))
     parser.add_argument("--page", type=Path, default=Path("leaderboards/attainable.md"))
     parser.add_argument("--page-only", action="store_true", help="measure nothing: the table of all suites anew")
@@ -115,13 +114,13 @@ def main():
         write_sections(arguments.page, INTRODUCTION, {"All suites": table, **sections})
 
     for name in () if arguments.page_only else arguments.suites:
-        rows, suite = [], load_suite(name)
+        suite, rows = by_label(load_suite(name), arguments.decisions, first_seed=FIRST), []
         method = method_for(suite.build(), suite.process)
-        for row in refined(suite, method, arguments.flights):
+        for row in refined(suite, method):
             rows.append(row)
             print(name, *row, sep="  ", flush=True)
         table = markdown(["settings", "per sample %", "per decision %", "log score", "us/sample"], rows)
-        sections[name] = f"`{method}`, {arguments.flights} fresh flights.\n\n{table}"
+        sections[name] = f"`{method}`, {suite.episodes} fresh flights.\n\n{table}"
         write()
     write()
 
