@@ -331,3 +331,12 @@ def test_where_sensors_may_fail_it_says_why_it_cannot():
     plant = build("B747Lateral", sensor_faults=True)
     with pytest.raises(NotApplicableError, match="no lines in theta"):
         onset_bank(plant, fit_belief(plant, "mixed"), "mixed")
+
+
+@pytest.mark.parametrize("plant_id", ["B747Lateral", "MissilePitch"])
+def test_a_process_that_says_when_faults_begin_is_none_to_be_told(plant_id):
+    """Else it would know the onset, and stand above ceilings that do."""
+    plant = build(plant_id)
+    assert len({tuple(f.onset for f in plant.draw("paper", seed).faults) for seed in range(5)}) == 1
+    with pytest.raises(NotApplicableError, match="at the same time in all flights"):
+        onset_bank(plant, fit_belief(plant, "paper"), "paper")

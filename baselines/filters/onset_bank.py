@@ -37,6 +37,7 @@ from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, NotApplicableError, Plant
 
 FIRST, DRAWN = 700_000, 2000  # scenarios from VALIDATION_SEED + FIRST on
+FEW = 10  # of them that show whether faults begin at different times
 GRID = 200  # onsets in a flight, where it is not said how far they are apart
 NEVER = -1e300  # log weight of a place where nothing is
 NEGLIGIBLE = -1000.0  # log weight, as a share of all, below which a filter is given up: at -100 some still come back
@@ -285,13 +286,19 @@ def onset_bank(
 
     Raises:
         ValueError: A number out of range.
-        NotApplicableError: Sensors may fail too, faults overlap, or one has no course that could be known.
+        NotApplicableError: Sensors may fail too, faults overlap, one has no course that could be known, or the process says
+            when they begin.
     """
     for name, value, least in (("onsets", onsets, 2), ("courses", courses, 1), ("sizes", sizes, 1)):
         if value < least:
             raise ValueError(f"{name} is {least} or more, not {value}")
     if every is not None and every < 1:
         raise ValueError(f"every is a sample or more, not {every}")
+    drawn = [plant.draw(process, VALIDATION_SEED + FIRST + i) for i in range(FEW)]
+    if any(s.faults for s in drawn) and len({tuple(f.onset for f in s.faults) for s in drawn}) == 1:
+        raise NotApplicableError(
+            "in this process faults begin at the same time in all flights: who is told it knows the onset"
+        )
     events = events_of_process(plant, process, courses, sizes)
     bank = Bank(plant, belief, events, onsets, max(1, len(events.onset) // GRID) if every is None else every)
     filter = Filter(bank.start, bank.predict, bank.update, bank.read, expect=bank.expect, innovation=lambda s: (s.nu, s.S))
