@@ -38,9 +38,9 @@ Written by `python benchmarks/attainable.py --page leaderboards/attainable.md`. 
 method is. What a method could reach that is told nothing but the process lies between the best such method on the board and
 the ceiling. `onset_bank` is meant to close that bracket from below: Bayes' rule over all that the process leaves open. It
 is exact where the model is linear, sizes are Gaussian and every onset is kept; the sections below show on fresh flights how
-little its score moves as that is refined. Where another method is better, it has not
-converged, or cannot run: faults that overlap, and sensors that fail in ways that are no line in theta. `mode_particles` can
-be refined there in its place.
+far its score moves as that is refined: where it still moves, what can be attained lies higher. Where another method is
+better, it has not converged, or cannot run: faults that overlap, and sensors that fail in ways that are no line in theta.
+`mode_particles` is refined there in its place.
 """
 
 
