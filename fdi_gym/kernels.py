@@ -257,8 +257,9 @@ def signature_of(dispatcher: Any) -> Any:
     return _signatures[dispatcher]
 
 
+@functools.cache
 def address(dispatcher: Any) -> int:
-    """The address of a kernel, compiled if need be, by which the generic kernels call it. Valid as long as it lives."""
+    """The address of a kernel, compiled if need be, by which the generic kernels call it."""
     (result,) = load(dispatcher).overloads.values()
     return result.library.get_pointer_to_function(result.fndesc.llvm_func_name)
 

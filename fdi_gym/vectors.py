@@ -20,12 +20,6 @@ from fdi_gym.integration import LANES
 from fdi_gym.kernels import helper
 
 
-@helper
-def width(columns):
-    """So many columns, in whole vectors of LANES."""
-    return (columns + LANES - 1) // LANES * LANES
-
-
 class Lanes(types.Type):
     """The type of a vector of so many numbers."""
 

@@ -202,11 +202,10 @@ def swept(plant: Plant, sweep: Sweep) -> Callable[[Running, Array], tuple[Runnin
             flat = (a.reshape(n * K, *a.shape[2:]) for a in (t, before, known))
             d = plant.measured_disturbance(*flat).reshape(n, K, -1)  # type: ignore[arg-type]
         declared, tested, waiting = s.rule
-        done = sweep(obs, d, s.k, *s.filter, declared, waiting)
-        after = type(s.filter)(done.X, done.P, done.nu, done.S, done.count)
+        done = sweep(obs, d, s.k, s.filter, declared, waiting)
         said = Diagnosis(done.alarm, done.label, done.estimate, done.std, None, done.state)
         rule = (done.declared, tested, done.waiting)
-        return Running(s.k + K, s.begun, u, np.zeros(u.shape), known[:, -1].copy(), after, rule), said
+        return Running(s.k + K, s.begun, u, np.zeros(u.shape), known[:, -1].copy(), type(s.filter)(*done.filter), rule), said
 
     return along
 

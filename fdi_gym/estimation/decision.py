@@ -29,7 +29,8 @@ from fdi_gym.estimation import label_kernels
 from fdi_gym.estimation.automaton import Automaton, first, step
 from fdi_gym.estimation.calibration import LEAST, Calibration, Persistence
 from fdi_gym.estimation.kalman import quadratic
-from fdi_gym.estimation.labels import Manifolds, distances, manifolds
+from fdi_gym.estimation.labels import Manifolds, manifolds
+from fdi_gym.kernels import address
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, Plant
 
@@ -221,10 +222,10 @@ def by_labels(
 
     def costs(r: Reading) -> tuple[Array, Array]:
         assert r.z is not None
-        assert r.P is not None
-        J, at = distances(r.z, r.P if fixed is None else fixed, sets, excess)
-        cost = np.empty((len(r.z), labels))
-        cost[:, 0], cost[:, sets.labels] = J[:, 0], J[:, 1:]
+        assert r.P is not None or fixed is not None
+        cost, at = np.empty((len(r.z), labels)), np.empty((len(r.z), h, f))
+        P = contiguous(r.P) if fixed is None else fixed
+        label_kernels.distances(address(label_kernels.fit_lanes), contiguous(r.z), P, excess, *sets, cost, at)
         return cost, at
 
     def step(state: Any, k: Array, r: Reading, informed: Array) -> tuple[Any, Verdict]:
@@ -242,16 +243,10 @@ def by_labels(
             penalty, none if rise is None else rise, limit, lengths, k, informed, declared, following, label, alarm,
         )  # fmt: skip
         z = None
-        if r.cost is not None or r.gain is not None:
-            cost, at = (r.cost, None) if r.cost is not None else costs(r)
-            cost = contiguous(cost if r.gain is None else np.where(r.gain > 0, np.minimum(cost, cost[:, :1] - r.gain), cost))
-            label_kernels.declare(cost, *told)
-        else:
-            assert r.z is not None
-            assert P is not None
-            P = P if fixed is None else fixed
-            cost, at = np.empty((n, labels)), np.empty((n, h, f))
-            label_kernels.judge(contiguous(r.z), P, excess, *sets, *told, cost, at)
+        cost, at = (contiguous(r.cost), None) if r.cost is not None else costs(r)
+        if r.gain is not None:
+            cost = np.where(r.gain > 0, np.minimum(cost, cost[:, :1] - r.gain), cost)
+        label_kernels.declare(cost, *told)
         if on_line and at is not None:
             z = (sets.points(at) * (sets.labels == label[:, None])[..., None]).sum(axis=1)
         return (following, tested, waiting), Verdict(alarm, label, z, Evidence(cost, rise))

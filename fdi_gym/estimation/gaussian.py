@@ -29,6 +29,8 @@ import numpy as np
 from fdi_gym.estimation import gaussian_kernels as kernels
 from fdi_gym.estimation.gaussian_model import Model, bind
 from fdi_gym.estimation.gaussian_points import CENTRAL_DIFFERENCE, EXTENDED, TANGENT, UNSCENTED
+from fdi_gym.estimation.gaussian_step import predict_lanes, update_lanes
+from fdi_gym.kernels import address
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array
 
@@ -157,7 +159,18 @@ def predict(
     """
     X1, P1 = np.empty(X.shape), np.empty(P.shape)
     known = model.unmeasured if d is None else d
-    _call(kernels.predict, (_rule(rule), *model.constants, model.limit, model.linear), X, P, t, u, known, Q, X1, P1)
+    _call(
+        kernels.predict,
+        (address(predict_lanes), _rule(rule), *model.constants, model.limit, model.linear),
+        X,
+        P,
+        t,
+        u,
+        known,
+        Q,
+        X1,
+        P1,
+    )
     return X1, P1
 
 
@@ -186,8 +199,8 @@ def update(
     nis, log, count = np.empty(n), np.empty(n), np.empty(n, np.int64)
     known = model.unmeasured if d is None else d
     _call(
-        kernels.update, (_rule(rule), *model.constants, model.H, model.plain, seen, count), X, P, t, u, known, y, R,
-        X1, P1, nu, S, nis, log,
+        kernels.update, (address(update_lanes), _rule(rule), *model.constants, model.H, model.plain, seen, count),
+        X, P, t, u, known, y, R, X1, P1, nu, S, nis, log,
     )  # fmt: skip
     return Updated(X1, P1, nu, S, nis, log, count)
 

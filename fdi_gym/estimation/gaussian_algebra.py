@@ -65,22 +65,12 @@ def in_turn(first, rows, whose):
 
 
 @helper
-def entry(given, whose, i, j, room):
-    """Entry (i, j) of matrices (rows, r, c) of which each lane has its own (`in_turn`); room (1, LANES)."""
+def entry(given, whose, at, room):
+    """Entry `at` of vectors (rows, n) or matrices (rows, r, c), each lane having its own (`in_turn`); room (1, LANES)."""
     if given.shape[0] == 1:
-        return zeros() + given[0, i, j]
+        return zeros() + given[0][at]
     for lane in range(LANES):
-        room[0, lane] = given[whose[lane], i, j]
-    return load(room, 0, 0)
-
-
-@helper
-def entry_of(given, whose, i, room):
-    """The same of vectors (rows, n)."""
-    if given.shape[0] == 1:
-        return zeros() + given[0, i]
-    for lane in range(LANES):
-        room[0, lane] = given[whose[lane], i]
+        room[0, lane] = given[whose[lane]][at]
     return load(room, 0, 0)
 
 
@@ -180,7 +170,7 @@ def predicted(mean, cross, cov, Q, whose, limit, X, P, room):
                 total = load(cross, j * N + i, 0)
             else:
                 total = (load(P, i * N + j, 0) + load(P, j * N + i, 0)) * 0.5
-            total += entry(Q, whose, i, j, room)
+            total += entry(Q, whose, (i, j), room)
             store(P, i * N + j, 0, total)
             store(P, j * N + i, 0, total)
     for i in range(N):

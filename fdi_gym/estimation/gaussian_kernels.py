@@ -9,7 +9,7 @@ from fdi_gym.estimation.gaussian_algebra import board_matrices, board_vectors, t
 from fdi_gym.estimation.gaussian_algebra import correct as correct_lanes
 from fdi_gym.estimation.gaussian_moments import differentiated, room_of
 from fdi_gym.estimation.gaussian_points import COMMANDS, KNOWN, SENSORS, STATES, pass_points
-from fdi_gym.estimation.gaussian_step import MODEL, hear, move, room_to_hear, room_to_predict
+from fdi_gym.estimation.gaussian_step import MODEL, predict_at, update_at
 from fdi_gym.integration import LANES
 from fdi_gym.kernels import M, V, compiled, floats, helper, inlined
 from fdi_gym.tangent import row
@@ -71,20 +71,21 @@ def ashore(first, Xs, Ps, X1, P1):
         take_matrix(Ps, lane, P1[first + lane])
 
 
-@compiled(void(int64, *MODEL, V, M, M, M3, V, M, M, M3, M, M3))
-def predict(rule, integers, reals, step, offset, direction, limit, plant, X, P, t, u, known, Q, X1, P1):
-    """X1 and P1 one sample after X (n, N) and P (n, N, N)."""
+@compiled(void(int64, int64, *MODEL, V, M, M, M3, V, M, M, M3, M, M3))
+def predict(lanes_at, rule, integers, reals, step, offset, direction, limit, plant, X, P, t, u, known, Q, X1, P1):
+    """X1 and P1 one sample after X (n, N) and P (n, N, N); lanes_at: the address of `predict_lanes`."""
     n, N = X.shape
     if n == 0:
         return
     _check(integers, step, n, N, t, u, known)
     _check_covariances(n, P, N, Q, N)
-    room, lanes = room_to_predict(rule, integers, reals, plant, N), room_aboard(N, integers)
+    lanes = room_aboard(N, integers)
     Xs, Ps, ts, us, ds = lanes
+    predict_lanes = predict_at(lanes_at)
     for first in range(0, n, LANES):
         aboard(first, X, P, t, u, known, lanes)
         some = min(LANES, n - first)
-        move(rule, integers, reals, step, offset, direction, limit, plant, first, some, Xs, Ps, ts, us, ds, Q, room)
+        predict_lanes(rule, integers, reals, step, offset, direction, limit, plant, first, some, Xs, Ps, ts, us, ds, Q)
         ashore(first, Xs, Ps, X1, P1)
 
 
@@ -128,20 +129,21 @@ def updated(first, there, nus, Ss, Us, distances, nu, S, distance, log):
         log[e] = density - 0.5 * distance[e]
 
 
-@compiled(void(int64, *MODEL, M, M, B2, I1, M, M3, V, M, M, M, M3, M, M3, M, M3, V, V))
+@compiled(void(int64, int64, *MODEL, M, M, B2, I1, M, M3, V, M, M, M, M3, M, M3, M, M3, V, V))
 def update(
-    rule, integers, reals, step, offset, direction, H, plain, seen, count, X, P, t, u, known, y, R,
+    lanes_at, rule, integers, reals, step, offset, direction, H, plain, seen, count, X, P, t, u, known, y, R,
     X1, P1, nu, S, distance, log,
 ):  # fmt: skip
-    """X1 and P1 after the sensors y (n, m) at t, of which `seen` reported."""
+    """X1 and P1 after the sensors y (n, m) at t, of which `seen` reported; lanes_at: the address of `update_lanes`."""
     (n, N), m = X.shape, integers[SENSORS]
     if n == 0:
         return
     _check(integers, step, n, N, t, u, known)
     _check_covariances(n, P, N, R, m)
     _check_sensors(n, m, y, seen)
-    room, lanes = room_to_hear(rule, integers, reals, H, N), room_aboard(N, integers)
+    lanes = room_aboard(N, integers)
     Xs, Ps, ts, us, ds = lanes
+    update_lanes = update_at(lanes_at)
     ys, there, nus, Ss, Us, distances = room_of_update(N, m)
     for e in range(n):
         count[e] = 0
@@ -152,11 +154,10 @@ def update(
         board_vectors(y, first, n // y.shape[0], ys)
         board_vectors(seen, first, n // y.shape[0], there)
         some = min(LANES, n - first)
-        found = hear(
-            rule, integers, reals, step, offset, direction, H, plain, first, some, Xs, Ps, ts, us, ds, ys, there, R, room,
-            nus, Ss, Us,
+        update_lanes(
+            rule, integers, reals, step, offset, direction, H, plain, first, some, Xs, Ps, ts, us, ds, ys, there, R,
+            nus, Ss, Us, distances,
         )  # fmt: skip
-        store(distances, 0, 0, found)
         ashore(first, Xs, Ps, X1, P1)
         updated(first, there, nus, Ss, Us, distances, nu, S, distance, log)
 

@@ -20,10 +20,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from fdi_gym.estimation.gaussian_algebra import entry, entry_of
+from fdi_gym.estimation.gaussian_algebra import entry
 from fdi_gym.estimation.gaussian_points import (
     DISTURBANCES,
     ENTRIES,
+    EVERY,
     KNOWN,
     OUTPUT,
     OUTPUTS,
@@ -84,18 +85,6 @@ def differenced(integers, reals, step, offset, direction, t, X, u, known, F, mea
 
 
 @helper
-def put_magnitude(integers, offset, direction, X, f, reals, now):
-    """As `put_magnitudes`, the entries that magnitude f moves alone."""
-    n_x = integers[STATES]
-    for e in range(integers[ENTRIES]):
-        if direction[e, f] != 0.0:
-            deviation = offset[e]
-            for j in range(direction.shape[1]):
-                deviation += direction[e, j] * X[n_x + j]
-            now[integers[SIZES + e]] = reals[1 + integers[SIZES + e]] + deviation
-
-
-@helper
 def sensed(integers, reals, step, offset, direction, t, X, u, known, room, x, y, F, mean):
     """mean = h(X) and F (m, W) its Jacobian, by central differences, one column after the other.
 
@@ -110,7 +99,7 @@ def sensed(integers, reals, step, offset, direction, t, X, u, known, room, x, y,
         x[i] = X[i]
     for i in range(d.size):
         d[i] = known[i]
-    put_magnitudes(integers, offset, direction, X, reals[1:], now)
+    put_magnitudes(integers, offset, direction, X, EVERY, reals[1:], now)
     for j in range(-1, N):  # first the mean
         if j >= n_x and not enters(False, integers, direction, j):
             for a in range(m):
@@ -120,7 +109,7 @@ def sensed(integers, reals, step, offset, direction, t, X, u, known, room, x, y,
             if j >= 0:
                 x[j] = X[j] + step[j] if side == 0 else X[j] - step[j]
             if n_x <= j < n_x + n_m:
-                put_magnitude(integers, offset, direction, x, j - n_x, reals, now)
+                put_magnitudes(integers, offset, direction, x, j - n_x, reals[1:], now)
             for i in range(n_d):
                 d[integers[SIZES + p + i]] = x[n_x + n_m + i]
             output(t, state, u, theta, d, physical, y)
@@ -138,7 +127,7 @@ def sensed(integers, reals, step, offset, direction, t, X, u, known, room, x, y,
         if j >= 0:
             x[j] = X[j]
         if n_x <= j < n_x + n_m:
-            put_magnitude(integers, offset, direction, x, j - n_x, reals, now)
+            put_magnitudes(integers, offset, direction, x, j - n_x, reals[1:], now)
 
 
 @inlined
@@ -212,11 +201,11 @@ def linearised(integers, offset, direction, plant, line, X, u, known, F, mean, r
             gain = zeros() + plant[a, E + e]
             for k in range(n_u):
                 gain += load(u, k, 0) * plant[a, E + (1 + k) * p + e]
-            total += gain * entry_of(offset, line, e, room)
+            total += gain * entry(offset, line, e, room)
             for j in range(n_m):
                 if direction.shape[0] > 1 or direction[0, e, j] != 0.0:
                     at = a * N + n_x + j
-                    store(F, at, 0, load(F, at, 0) + gain * entry(direction, line, e, j, room))
+                    store(F, at, 0, load(F, at, 0) + gain * entry(direction, line, (e, j), room))
         for j in range(n_d):
             i = integers[SIZES + p + j]
             store(F, a * N + n_x + n_m + j, 0, zeros() + plant[a, G + i])
@@ -235,7 +224,7 @@ def differentiated(integers, reals, step, offset, direction, t, X, u, known, roo
     now, theta, physical, d, L, used = room
     n, own, n_D = integers[STATES], integers[OWN], integers[KNOWN]
     n_theta, p, n_d, n_m, count = integers[THETA], integers[ENTRIES], integers[DISTURBANCES], direction.shape[1], 0
-    put_magnitudes(integers, offset, direction, X, reals[1:], now)
+    put_magnitudes(integers, offset, direction, X, EVERY, reals[1:], now)
     for e in range(p):
         i = integers[SIZES + e]
         if i < own or i >= n_theta:  # else it is a fault of a sensor

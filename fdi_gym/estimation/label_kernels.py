@@ -9,7 +9,7 @@ from fdi_gym.estimation.automaton import advance
 from fdi_gym.estimation.gaussian_algebra import board_matrices, board_vectors
 from fdi_gym.estimation.label_algebra import informative, invert, nearest_points, room
 from fdi_gym.integration import LANES
-from fdi_gym.kernels import M, V, compiled, floats, helper, inlined
+from fdi_gym.kernels import M, V, compiled, floats, function_at, helper, inlined, signature_of
 from fdi_gym.vectors import load, store, zeros
 
 I1, I2, B1, M3 = int64[::1], int64[:, ::1], boolean[::1], float64[:, :, ::1]
@@ -36,43 +36,49 @@ def nearest(I, Iz, faults, offset, direction, low, high, value, m):  # noqa: E74
                     m[first + lane, s, r] = at[s * f + r, lane]
 
 
-@inlined
-def room_to_fit(direction):
-    """What `fit` works in, and what it leaves: the distance to healthy, and to the sets, with their magnitudes."""
-    sets, p, f = direction.shape
-    inner = room(p, f), floats((p * p, LANES)), floats((p * p, LANES)), floats((p, LANES))
-    return inner, floats((1, LANES)), floats((sets, LANES)), floats((sets * f, LANES))
+@compiled(void(M, M, M, *SETS, boolean, M, M, M, M))
+def fit_lanes(z, P, excess, faults, offset, direction, low, high, known, I, healthy, values, m):  # noqa: E741
+    """Squared distances of estimates z (p) to healthy (1) and the sets, values (sets) with their magnitudes m (sets f).
 
-
-@helper
-def fit(z, P, excess, faults, offset, direction, low, high, known, found):
-    """Squared distances of the estimates z (p) to healthy and the sets, in the metric of P (p p) + excess, in lanes.
-
-    known: P and excess are those of the last call.
+    The metric is that of P (p p) + excess, all in lanes; known: I (p p), the inverse of that, is the last call's.
     """
-    (of_points, a, I, Iz), healthy, values, at = found  # noqa: E741
-    p = z.shape[0]
+    p, (sets, _, f) = z.shape[0], direction.shape
+    Iz, work, inner = floats((p, LANES)), floats((p * p, LANES)), room(p, f)
     if not known:
-        invert(P, excess, p, a, I)
+        invert(P, excess, p, work, I)
     store(healthy, 0, 0, informative(I, z, p, Iz))
-    nearest_points(I, Iz, faults, offset, direction, low, high, values, at, of_points)
-    for s in range(len(faults)):
+    nearest_points(I, Iz, faults, offset, direction, low, high, values, m, inner)
+    for s in range(sets):
         store(values, s, 0, load(values, s, 0) + load(healthy, 0, 0))
 
 
-@compiled(void(M, M3, M, *SETS, M, M3))
-def distances(z, P, excess, faults, offset, direction, low, high, J, m):
-    """J (n, 1 + sets): squared distances of z (n, p) to healthy and each set in the metric of P (n or 1, p, p) + excess."""
+fit_at = function_at(signature_of(fit_lanes))
+
+
+@inlined
+def room_to_fit(direction):
+    """What `fit_lanes` leaves."""
+    sets, p, f = direction.shape
+    return floats((p * p, LANES)), floats((1, LANES)), floats((sets, LANES)), floats((sets * f, LANES))
+
+
+@compiled(void(int64, M, M3, M, I1, *SETS, M, M3))
+def distances(lanes_at, z, P, excess, labels, faults, offset, direction, low, high, cost, m):
+    """Squared distances of z (n, p) to healthy, cost[:, 0], and to set s, cost[:, labels[s]], with magnitudes m (n, sets, f)
+
+    The metric is that of P (n or 1, p, p) + excess; lanes_at: the address of `fit_lanes`.
+    """
     (n, p), f, found = z.shape, direction.shape[2], room_to_fit(direction)
-    zs, Ps, (_, healthy, values, at) = floats((p, LANES)), floats((p * p, LANES)), found
+    zs, Ps, (I, healthy, values, at) = floats((p, LANES)), floats((p * p, LANES)), found  # noqa: E741
+    fit = fit_at(lanes_at)
     for first in range(0, n, LANES):
         board_vectors(z, first, 1, zs)
         board_matrices(P, first, Ps)
-        fit(zs, Ps, excess, faults, offset, direction, low, high, first > 0 and len(P) == 1, found)
+        fit(zs, Ps, excess, faults, offset, direction, low, high, first > 0 and len(P) == 1, I, healthy, values, at)
         for lane in range(min(LANES, n - first)):
-            J[first + lane, 0] = healthy[0, lane]
+            cost[first + lane, 0] = healthy[0, lane]
             for s in range(len(faults)):
-                J[first + lane, 1 + s] = values[s, lane]
+                cost[first + lane, labels[s]] = values[s, lane]
                 for r in range(f):
                     m[first + lane, s, r] = at[s * f + r, lane]
 
@@ -160,43 +166,21 @@ def declare(cost, penalty, statistic, limit, after, k, informed, state, state1, 
         label[e], alarm[e] = state1[e, 0], state1[e, 0] > 0
 
 
-@compiled(void(M, M3, M, I1, *SETS, V, V, float64, I1, I1, B1, I2, I2, I1, B1, M, M3))
-def judge(
-    z, P, excess, labels, faults, offset, direction, low, high,
-    penalty, statistic, limit, after, k, informed, state, state1, label, alarm, cost, m,
-):  # fmt: skip
-    """`distances` as the costs of `declare`: of health, and of set s at labels[s]."""
-    (n, p), f, found = z.shape, direction.shape[2], room_to_fit(direction)
-    zs, Ps, (_, healthy, values, at) = floats((p, LANES)), floats((p * p, LANES)), found
-    for first in range(0, n, LANES):
-        board_vectors(z, first, 1, zs)
-        board_matrices(P, first, Ps)
-        fit(zs, Ps, excess, faults, offset, direction, low, high, first > 0 and len(P) == 1, found)
-        for lane in range(min(LANES, n - first)):
-            e = first + lane
-            cost[e, 0] = healthy[0, lane]
-            for s in range(len(faults)):
-                cost[e, labels[s]] = values[s, lane]
-                for r in range(f):
-                    m[e, s, r] = at[s * f + r, lane]
-            declared(cost[e], penalty, statistic[e : e + 1], limit, after, k[e], informed[e], state[e], state1[e])
-            label[e], alarm[e] = state1[e, 0], state1[e, 0] > 0
-
-
-@compiled(void(M, M, M, boolean, I1, *SETS, V, float64, I1, I1, B1, I2, M))
+@compiled(void(int64, M, M, M, boolean, I1, *SETS, V, float64, I1, I1, B1, I2, M))
 def decide_lanes(
-    z, P, excess, fixed, labels, faults, offset, direction, low, high, penalty, limit, after, k, informed, state, waiting
+    lanes_at, z, P, excess, fixed, labels, faults, offset, direction, low, high, penalty, limit, after, k, informed, state,
+    waiting,
 ):  # fmt: skip
-    """`wait` and `judge` for whoever has its estimates in lanes: state (LANES, 5) and waiting are brought up to the sample.
+    """`wait`, `distances` and `declare` for whoever has its estimates in lanes: state (LANES, 5) and waiting move on.
 
     z (p, LANES) and P (p p, LANES), or where `fixed`, excess alone is the metric.
     """
-    p, found = z.shape[0], room_to_fit(direction)
-    _, healthy, values, _ = found
+    p, (I, healthy, values, at) = z.shape[0], room_to_fit(direction)  # noqa: E741
     cost, variances, nothing, metric = floats(penalty.size), floats(p), floats(0), floats(P.shape)
+    fit = fit_at(lanes_at)
     for i in range(p * p):
         store(metric, i, 0, zeros() if fixed else load(P, i, 0))
-    fit(z, metric, excess, faults, offset, direction, low, high, False, found)
+    fit(z, metric, excess, faults, offset, direction, low, high, False, I, healthy, values, at)
     for lane in range(LANES):
         for i in range(p):
             variances[i] = P[i * (p + 1), lane]
@@ -205,3 +189,6 @@ def decide_lanes(
             cost[labels[s]] = values[s, lane]
         counts = sure_again(informed[lane], variances, waiting[lane], waiting[lane])
         declared(cost, penalty, nothing, limit, after, k[lane], counts, state[lane], state[lane])
+
+
+decide_at = function_at(signature_of(decide_lanes))

@@ -13,6 +13,7 @@ import numpy as np
 
 from fdi_gym.estimation import label_kernels
 from fdi_gym.estimation.belief import FaultInputs
+from fdi_gym.kernels import address
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, Plant
 
@@ -89,7 +90,9 @@ def distances(z: Array, P: Array, sets: Manifolds, excess: Array | None = None) 
     n, (h, p, f) = len(z), sets.direction.shape
     J, m = np.empty((n, 1 + h)), np.empty((n, h, f))
     nothing = np.zeros((p, p)) if excess is None else excess
-    label_kernels.distances(contiguous(z), contiguous(P), nothing, *sets[1:], J, m)
+    label_kernels.distances(
+        address(label_kernels.fit_lanes), contiguous(z), contiguous(P), nothing, np.arange(1, 1 + h), *sets[1:], J, m
+    )
     return Distances(J, m)
 
 

@@ -12,7 +12,7 @@ from fdi_gym.integration import LANES
 from fdi_gym.kernels import compiled
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array
-from fdi_gym.vectors import load, store, width, zeros
+from fdi_gym.vectors import load, store, zeros
 
 M3, M4 = float64[:, :, ::1], float64[:, :, :, ::1]
 
@@ -38,7 +38,7 @@ def mixture(w: Array, X: Array, P: Array) -> tuple[Array, Array]:
 @compiled(void(M3, M3, M4, M3, M4), heap=True)  # a bank has many models
 def _mixture(w, X, P, mean, mixed):
     (n, L, N), to = X.shape, w.shape[1]
-    W = width(N)
+    W = (N + LANES - 1) // LANES * LANES
     points, wide = np.zeros((L + 1, W)), np.zeros((L * N, W))  # rows in whole vectors; the last point is the mean
     spread, total = np.empty((L, W)), np.empty((1, W))
     for e in range(n):

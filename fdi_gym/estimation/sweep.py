@@ -23,11 +23,9 @@ from fdi_gym.plant import Array, Plant
 class Swept(NamedTuple):
     """State of a filter and its decision after the last sample, and what was said of each."""
 
-    X: Array  # (n, N)
-    P: Array  # (n, N, N)
-    nu: Array  # (n, m) last innovation
-    S: Array  # (n, m, m) its covariance
-    count: Array  # (n,) sensors in it
+    filter: tuple[
+        Array, ...
+    ]  # X (n, N), P (n, N, N), nu (n, m) the last innovation, S (n, m, m), count (n,) of sensors in it
     declared: Array  # (n, 5) the automata
     waiting: Array  # (n, 2 + p)
     alarm: Array  # (n, K) bool
@@ -69,26 +67,24 @@ def sweep_of(
     noises = contiguous(Q[None]), contiguous(R[None])
     head = (RULES[rule], *model.constants, model.limit, model.linear, model.H, model.plain, *noises)
     age = Age(sweep_kernels.no_age, np.zeros(0)) if age is None else age
-    steps = np.array([address(kernel) for kernel in (*sweep_kernels.STEPS, age.kernel)])
     metric = decision.excess if decision.metric is None else decision.metric[0]
     weighed = (
         metric, decision.metric is not None, decision.sets.labels, *decision.sets[1:], decision.penalty,
         decision.limit, decision.lengths, healthy,
     )  # fmt: skip
 
-    def sweep(
-        obs: Array, d: Array | None, k: Array, X: Array, P: Array, nu: Array, S: Array, count: Array, declared: Array,
-        waiting: Array,
-    ) -> Swept:  # fmt: skip
+    def sweep(obs: Array, d: Array | None, k: Array, filter: tuple[Array, ...], declared: Array, waiting: Array) -> Swept:
         """Over obs (n, K, n_obs) with measured disturbances d (n, K, n_D), from sample k (n,) on; states as in `Swept`."""
         n, K, _ = obs.shape
+        steps = np.array([address(kernel) for kernel in (*sweep_kernels.STEPS, age.kernel)])
         known = np.zeros((n, K, len(plant.disturbances))) if d is None else contiguous(d)
-        after = [np.array(a, order="C") for a in (X, P, nu, S, count, declared, waiting)]
+        *after, declared, waiting = (np.array(a, order="C") for a in (*filter, declared, waiting))
         alarm, label, state = np.empty((n, K), bool), np.empty((n, K), np.int16), np.empty((n, K, len(plant.states)))
         estimate, std = np.empty((2, n, K, len(healthy)))
         sweep_kernels.sweep(
-            steps, age.constants, *head, *weighed, contiguous(obs), known, k, *after, alarm, label, estimate, std, state,
+            steps, age.constants, *head, *weighed, contiguous(obs), known, k, *after, declared, waiting, alarm, label,
+            estimate, std, state,
         )  # fmt: skip
-        return Swept._make([*after, alarm, label, estimate, std, state])
+        return Swept(tuple(after), declared, waiting, alarm, label, estimate, std, state)
 
     return sweep

@@ -7,10 +7,10 @@ from numba import boolean, float64, int16, int64, void
 
 from fdi_gym.estimation.gaussian_algebra import board_matrices, board_vectors, take_matrix, take_vector
 from fdi_gym.estimation.gaussian_points import COMMANDS, DISTURBANCES, ENTRIES, KNOWN, OUTPUTS, SENSORS, SIZES, STATES
-from fdi_gym.estimation.gaussian_step import MODEL, predict_lanes, update_lanes
-from fdi_gym.estimation.label_kernels import SETS, decide_lanes
+from fdi_gym.estimation.gaussian_step import MODEL, predict_at, predict_lanes, update_at, update_lanes
+from fdi_gym.estimation.label_kernels import SETS, decide_at, decide_lanes, fit_lanes
 from fdi_gym.integration import LANES
-from fdi_gym.kernels import M, V, bools, compiled, floats, function_at, helper, ints, signature_of
+from fdi_gym.kernels import M, V, bools, compiled, floats, function_at, helper, ints
 from fdi_gym.vectors import load, store
 
 I1, I2, M3 = int64[::1], int64[:, ::1], float64[:, :, ::1]
@@ -22,8 +22,8 @@ def no_age(constants, n_x, P):
     """Nothing becomes of a prediction's covariance P (N N) in lanes; x are its first n_x entries."""
 
 
-STEPS = predict_lanes, update_lanes, decide_lanes
-predict_at, update_at, decide_at, age_at = (function_at(s) for s in (*(signature_of(kernel) for kernel in STEPS), AGE))
+STEPS = predict_lanes, update_lanes, fit_lanes, decide_lanes
+age_at = function_at(AGE)
 
 
 @helper
@@ -73,13 +73,14 @@ def sweep(
     (n, N), K, n_x, m, p = X.shape, obs.shape[1], integers[STATES], integers[SENSORS], healthy.size
     predict = predict_at(steps[0])
     update = update_at(steps[1])
-    decide = decide_at(steps[2])
-    age = age_at(steps[3])
+    decide = decide_at(steps[3])
+    age = age_at(steps[4])
     Xs, Ps, ts, us, ds = (
         floats((N, LANES)), floats((N * N, LANES)), floats(LANES), floats((integers[COMMANDS], LANES)),
         floats((integers[KNOWN], LANES)),
     )  # fmt: skip
     ys, there, nus, Ss = floats((m, LANES)), floats((m, LANES)), floats((m, LANES)), floats((m * m, LANES))
+    Us, distance = floats((m * m, LANES)), floats((1, LANES))
     Pz, ks, informed = floats((p * p, LANES)), ints(LANES), bools(LANES)
     stands, waits = ints((LANES, 5)), floats((LANES, 2 + p))
     zs = Xs[n_x : n_x + p]
@@ -108,14 +109,14 @@ def sweep(
                     informed[lane] = informed[lane] or there[a, lane] > 0.0
             update(
                 rule, integers, reals, step, offset, direction, H, plain, first, some, Xs, Ps, ts, us, ds, ys, there, R, nus,
-                Ss,
+                Ss, Us, distance,
             )  # fmt: skip
             for i in range(p):
                 for j in range(p):
                     store(Pz, i * p + j, 0, load(Ps, (n_x + i) * N + n_x + j, 0))
             decide(
-                zs, Pz, excess, fixed, labels, faults, at, along, low, high, penalty, rise, after, ks, informed, stands,
-                waits,
+                steps[2], zs, Pz, excess, fixed, labels, faults, at, along, low, high, penalty, rise, after, ks, informed,
+                stands, waits,
             )  # fmt: skip
             for lane in range(some):
                 e = first + lane
