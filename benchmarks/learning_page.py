@@ -22,7 +22,13 @@ from fdi_gym.tables import clairvoyant, markdown
 
 HOME = Path(__file__).parent.parent / "leaderboards"
 LEARNED = tuple(name for name, entry in diagnosers().items() if entry.build.__module__.startswith("baselines.learned."))
-REFERENCE = ("bayes_bank", "switching_bayes_bank", "hypothesis_bank", "onset_bank")  # this package's own, of no paper
+REFERENCE = (
+    "bayes_bank",
+    "switching_bayes_bank",
+    "hypothesis_bank",
+    "onset_bank",
+    "onset_bank_fine",
+)  # this package's own, of no paper
 FLOOR = ("null", "random")
 
 
