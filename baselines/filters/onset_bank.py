@@ -79,10 +79,12 @@ class Bank:
         P0[range(self.m.stop, model.z.stop), range(self.m.stop, model.z.stop)] = 1.0
         self.model, self.r, self.count = model.replace(P0=P0), r, 1 + r * onsets
         self.M0 = np.zeros((r, f, f))
-        self.M0[:, range(f), range(f)] = events.direction.any(axis=1)
+        self.M0[:, range(f), range(f)] = (events.direction != 0.0).any(axis=1) | (events.steady_direction != 0.0).any(axis=1)
         inputs = fault_inputs(plant)
         places = events.entries.tolist()
         self.p = len(inputs.entries)
+        parts = events.offset, events.direction, events.steady, events.steady_direction, events.spread
+        self.deviations = tuple(contiguous(a) for a in parts)
         known = [(j, places.index(e)) for j, e in enumerate(inputs.entries.tolist()) if e in places]
         self.known = np.array(known, np.int64).reshape(-1, 2).T  # (2, entries): of the fault vector, of the events
 
@@ -108,8 +110,7 @@ class Bank:
         """The model on the lines of these filters."""
         (_, p, f), (e, c) = self.events.direction.shape, self.events.spread.shape
         offset, direction = np.zeros((len(rows), p + e)), np.zeros((len(rows), p + e, f + c))
-        events = contiguous(self.events.offset), contiguous(self.events.direction), contiguous(self.events.spread)
-        lines(rows, self.s, contiguous(s.length), contiguous(s.held), *events, offset, direction)
+        lines(rows, self.s, contiguous(s.length), contiguous(s.held), *self.deviations, offset, direction)
         return self.model.on(offset, direction)
 
     def ended(self, s: Onsets, step: Array) -> Onsets:
@@ -233,8 +234,9 @@ class Bank:
         probs /= probs.sum(axis=1, keepdims=True)
         z, (j, at) = np.zeros((n, self.p)), self.known
         m = s.X[:, 1:, self.m].reshape(n, self.r, self.s, -1, 1)
-        along = self.events.offset[:, None, at] + (self.events.direction[:, None, at] @ m)[..., 0]
-        theta = s.length[..., None] * along + s.held[..., at]  # (n, r, s, entries)
+        offset, direction, steady, steady_direction = (a[:, None, at] for a in self.deviations[:4])
+        along, beside = offset + (direction @ m)[..., 0], steady + (steady_direction @ m)[..., 0]
+        theta = s.length[..., None] * along + s.held[..., at] + beside  # (n, r, s, entries)
         z[:, j] = (w[:, 1:, None] * theta.reshape(n, self.count - 1, len(at))).sum(axis=1)
         x = (w[..., None] * s.X[..., self.model.x]).sum(axis=1)
         return Reading(z, x=x, nu=s.nu, S=s.S, probs=probs)
@@ -244,7 +246,7 @@ class Bank:
         return self.model.expect(s.X[:, 0, self.model.x], at)
 
 
-def events_of_process(plant: Plant, process: str, courses: int, sizes: int) -> Events:
+def events_of_process(plant: Plant, process: str, courses: int, sizes: int, overlapping: bool = False) -> Events:
     """The events of a fault process, counted in scenarios with validation seeds.
 
     Raises:
@@ -253,7 +255,7 @@ def events_of_process(plant: Plant, process: str, courses: int, sizes: int) -> E
     if plant.bare is not None:
         raise NotApplicableError("sensors that fail by noise, freezing or spikes are no lines in theta")
     drawn = [plant.draw(process, VALIDATION_SEED + FIRST + i) for i in range(DRAWN)]
-    return events_of(plant, drawn, courses=courses, sizes=sizes)
+    return events_of(plant, drawn, courses=courses, sizes=sizes, overlapping=overlapping)
 
 
 def most_telling(events: Events) -> Rule:

@@ -36,12 +36,12 @@ def put(table: Array, rows: Array, values: Array) -> Array:
     return found
 
 
-@compiled(void(int64[::1], int64, M3, M4, M, M3, M, M, M3))
-def lines(rows, slots, length, held, offset, direction, spread, offsets, directions):
+@compiled(void(int64[::1], int64, M3, M4, M, M3, M, M3, M, M, M3))
+def lines(rows, slots, length, held, offset, direction, steady, steady_direction, spread, offsets, directions):
     """Offsets (rows, p + e) and directions (rows, p + e, f + c) of the filters in these rows; they come zeroed.
 
-    length (n, r, slots), held (n, r, slots, p), offset (r, p) and direction (r, p, f) are the events', spread (e, c) the
-    parameters'. In an episode's rows the healthy filter is the first.
+    length (n, r, slots), held (n, r, slots, p), offset, steady (r, p) and their directions (r, p, f) are the events', spread
+    (e, c) the parameters'. In an episode's rows the healthy filter is the first.
     """
     (kinds, p, f), (e, c) = direction.shape, spread.shape
     count = 1 + kinds * slots
@@ -51,9 +51,9 @@ def lines(rows, slots, length, held, offset, direction, spread, offsets, directi
             kind, slot = (place - 1) // slots, (place - 1) % slots
             share = length[of, kind, slot]
             for a in range(p):
-                offsets[i, a] = share * offset[kind, a] + held[of, kind, slot, a]
+                offsets[i, a] = share * offset[kind, a] + (held[of, kind, slot, a] + steady[kind, a])
                 for b in range(f):
-                    directions[i, a, b] = share * direction[kind, a, b]
+                    directions[i, a, b] = share * direction[kind, a, b] + steady_direction[kind, a, b]
         for a in range(e):
             for b in range(c):
                 directions[i, p + a, f + b] = spread[a, b]

@@ -2,8 +2,8 @@
 
 An event is what begins and ends together: one fault, or several at once. Events of a kind move the same entries of theta in
 the same way: at once to a value, or along a course of time. Within a kind the values are Gaussian along a few directions;
-a kind whose values or courses are spread widely is cut into cells. All of it is counted in scenarios that are drawn from the
-process; nothing is flown.
+a kind whose values or courses are spread widely is cut into cells. Events follow one another, or overlap: then others may
+begin while some act. All of it is counted in scenarios that are drawn from the process; nothing is flown.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi_gym.faults import Abrupt, Fault, FaultScenario, Hold, Incipient, Intermittent, Ramp
+from fdi_gym.faults import Abrupt, Fault, FaultScenario, Hold, Incipient, Intermittent, Ramp, Samples, Square
 from fdi_gym.plant import Array, NotApplicableError, Plant
 
 FEWEST = 10  # events from which a cell is made
@@ -22,8 +22,7 @@ NEGLIGIBLE = 1e-6  # share of the largest variance below which a direction is le
 MOVED = 0.1  # what a held command may have moved since the onset, in units of its scale: it is not known to the sample
 MANY = 8  # parameters, beyond which they are left to the noise that stands for errors of the model
 BINS = 100  # of a flight, over which the onsets are counted
-AT_ONCE, SATURATES, RISES, COMES_AND_GOES = range(4)  # courses
-OF_EFFECT = {Incipient: SATURATES, Ramp: RISES, Intermittent: COMES_AND_GOES}
+AT_ONCE, SATURATES, RISES, COMES_AND_GOES, ALTERNATES, WANDERS = range(6)  # courses
 
 
 class Events(NamedTuple):
@@ -31,16 +30,20 @@ class Events(NamedTuple):
 
     entries: Array  # (p,) positions in theta
     label: Array  # (r,)
-    offset: Array  # (r, p) deviation of the entries from healthy at magnitudes of zero
-    direction: Array  # (r, p, f)
+    modes: Array  # (r,) the modes as bits
+    offset: Array  # (r, p) deviation of the entries from healthy at magnitudes of zero, times the course, and
+    steady: Array  # (r, p) deviation that has none
+    direction: Array  # (r, p, f) what a magnitude adds to the first, and
+    steady_direction: Array  # (r, p, f) to the second
     held: Array  # (r, p) the command at whose value an entry is held from the onset on; -1: none
     lag: Array  # (r, p) how many steps before the onset that is
     course: Array  # (r,) one of the courses
-    first: Array  # (r,) 1 / rate, duration or period of the course [s]
+    first: Array  # (r,) 1 / rate, duration or period of the course [s]; of one that wanders, its correlation over a sample
     second: Array  # (r,) duty
     log_prior: Array  # (r,) of an event to be of the cell
     onset: Array  # (K,) probability that the first event begins at a step, and
     again: Array  # (K,) that another begins so many steps after one has ended
+    more: Array  # (most - 1,) that another begins at a step at which 1, 2, ... act; empty: they follow one another
     end: Array  # (ages,) probability that it ends at an age [samples] that it has reached; empty: events stay
     share: Array  # (labels,) of the samples
     physical: Array  # (e,) positions in p of the physical parameters that are drawn for a flight, and
@@ -48,15 +51,20 @@ class Events(NamedTuple):
 
     def at(self, age: Array) -> Array:
         """The courses at an age [s]: (..., r, slots) of ages (..., r, slots), as shares of the values."""
-        first, second = self.first[:, None], self.second[:, None]
+        return self.of(np.arange(len(self.course))[:, None], age)
+
+    def of(self, kind: Array, age: Array) -> Array:
+        """Those of some kinds, by number, of the shape of their ages [s]."""
+        course, first, second = self.course[kind], self.first[kind], self.second[kind]
         found = np.ones(age.shape)
         with np.errstate(divide="ignore", invalid="ignore"):
-            for course, values in (
+            for which, values in (
                 (SATURATES, -np.expm1(-age / first)),
                 (RISES, np.minimum(age / first, 1.0)),
                 (COMES_AND_GOES, ((age / first) % 1.0 < second).astype(float)),
+                (ALTERNATES, np.where((age / first) % 1.0 < 0.5, 1.0, -1.0)),
             ):
-                found = np.where(self.course[:, None] == course, values, found)
+                found = np.where(course == which, values, found)
         return found
 
 
@@ -79,11 +87,13 @@ class _Count:
 
 
 class _Event(NamedTuple):
-    label: int
+    modes: frozenset[str]
     kind: tuple[Any, ...]
     values: Array  # (p,) deviations
+    steady: Array  # (p,) those without a course
     first: float
     second: float
+    wander: Array  # (samples,) deviations of the entry that wanders; empty: none does
 
 
 def _groups(scenario: FaultScenario) -> list[tuple[int, int, list[Fault]]]:
@@ -96,16 +106,24 @@ def _groups(scenario: FaultScenario) -> list[tuple[int, int, list[Fault]]]:
     return [(onset, end, faults) for (onset, end), faults in sorted(found.items())]
 
 
-def _event(plant: Plant, entries: list[int], faults: list[Fault]) -> _Event:
+def _event(plant: Plant, entries: list[int], faults: list[Fault], wandering: bool) -> _Event:
     names, nominal = plant.theta_entries, plant.nominal_theta
-    values, held, lag = np.zeros(len(entries)), [-1] * len(entries), [0] * len(entries)
-    course, first, second = AT_ONCE, 1.0, 1.0
+    values, steady, held, lag = np.zeros(len(entries)), np.zeros(len(entries)), [-1] * len(entries), [0] * len(entries)
+    course, first, second, wander = AT_ONCE, 1.0, 1.0, np.zeros(0)
     commands = [s.name for s in plant.commands]
     for effect in itertools.chain.from_iterable(fault.effects for fault in faults):
         j = entries.index(names.index(effect.entry))
         match effect:
             case Hold(command=command):
                 held[j], lag[j], values[j] = commands.index(command), effect.lag, -nominal[entries[j]]
+                continue
+            case Square(value=value, other=other, period=period):
+                course, first = ALTERNATES, period
+                values[j], steady[j] = (value - other) / 2, (value + other) / 2 - nominal[entries[j]]
+                continue
+            case Samples(values=samples) if wandering:
+                course, wander = WANDERS, np.array(samples) - nominal[entries[j]]
+                values[j] = wander.mean()
                 continue
             case Abrupt():
                 pass
@@ -118,9 +136,14 @@ def _event(plant: Plant, entries: list[int], faults: list[Fault]) -> _Event:
             case _:
                 raise NotApplicableError(f"a fault that is {type(effect).__name__} has no course that could be known")
         values[j] = effect.value - nominal[entries[j]]
-    label = plant.label_of(frozenset(fault.mode for fault in faults))
-    kind = (label, tuple(sorted(fault.kind for fault in faults)), course, tuple(held), tuple(lag))
-    return _Event(label, kind, values, first, second)
+    if course == ALTERNATES:  # nothing else of the fault does
+        waves = np.array(
+            [any(isinstance(e, Square) and names[i] == e.entry for f in faults for e in f.effects) for i in entries]
+        )
+        values, steady = np.where(waves, values, 0.0), np.where(waves, steady, values)
+    modes = frozenset(fault.mode for fault in faults)
+    kind = (plant.label_of(modes), tuple(sorted(fault.kind for fault in faults)), course, tuple(held), tuple(lag))
+    return _Event(modes, kind, values, steady, first, second, wander)
 
 
 def _cells(events: list[_Event], courses: int, sizes: int) -> list[list[_Event]]:
@@ -150,7 +173,9 @@ def _parameters(plant: Plant, scenarios: Sequence[FaultScenario]) -> tuple[Array
     return (which, spread) if spread.shape[1] <= MANY else (which[:0], np.zeros((0, 0)))
 
 
-def events_of(plant: Plant, scenarios: Sequence[FaultScenario], *, courses: int = 2, sizes: int = 1) -> Events:
+def events_of(
+    plant: Plant, scenarios: Sequence[FaultScenario], *, courses: int = 2, sizes: int = 1, overlapping: bool = False
+) -> Events:
     """The events of a process, from scenarios that it drew.
 
     Args:
@@ -158,6 +183,7 @@ def events_of(plant: Plant, scenarios: Sequence[FaultScenario], *, courses: int 
         scenarios: Thousands of them, of one length.
         courses: Cells of a kind whose course varies, by the time that it takes.
         sizes: Cells of each of those, by the values.
+        overlapping: Events may overlap, and one may wander: its values are then a first-order Gaussian sequence.
 
     Raises:
         NotApplicableError: Events overlap, or a fault has no course that could be known.
@@ -166,45 +192,95 @@ def events_of(plant: Plant, scenarios: Sequence[FaultScenario], *, courses: int 
     entries = sorted({names.index(e.entry) for s in scenarios for fault in s.faults for e in fault.effects})
     K, labels = max(s.steps for s in scenarios), len(plant.labels)
     first, again = _Count(K), _Count(K)
-    samples, lasts = np.zeros(labels), _Count(K + 1)
+    samples, lasts, begun, acted = np.zeros(labels), _Count(K + 1), np.zeros(0), np.zeros(0)
     kinds: dict[tuple[Any, ...], list[_Event]] = {}
     for scenario in scenarios:
-        groups, free = _groups(scenario), 0
-        if any(later[0] < earlier[1] for earlier, later in itertools.pairwise(groups)):
-            raise NotApplicableError("faults of this process overlap in time: it has no events one after the other")
+        groups, free, acting = _groups(scenario), 0, []  # free: since when; acting: ends of those that act
         for onset, end, faults in groups:
-            event = _event(plant, entries, faults)
+            acting = [other for other in acting if other > onset]
+            if acting and not overlapping:
+                raise NotApplicableError("faults of this process overlap in time: it has no events one after the other")
+            event = _event(plant, entries, faults, overlapping)
             kinds.setdefault(event.kind, []).append(event)
-            (again if free else first).add(onset - free, True)
+            if acting:
+                begun = _longer(begun, len(acting))
+                begun[len(acting) - 1] += 1
+            else:
+                (again if free else first).add(onset - free, True)
             lasts.add(end - onset, end < scenario.steps)
-            samples[event.label] += end - onset
-            free = end
+            acting.append(end)
+            free = max(free, end)
         if free < scenario.steps:
             (again if free else first).add(scenario.steps - free - 1, False)
+        for label, count, length in _pieces(plant, groups):
+            samples[label] += length
+            acted = _longer(acted, count)
+            acted[count - 1] += length
     samples[0] = sum(s.steps for s in scenarios) - samples[1:].sum()
     if not kinds:
         raise NotApplicableError("the process has no faults")
     cells = [cell for key in sorted(kinds, key=str) for cell in _cells(kinds[key], courses, sizes)]
     r, p = len(cells), len(entries)
-    offset, held, lag = np.zeros((r, p)), np.zeros((r, p), np.int64), np.zeros((r, p), np.int64)
-    lines = []
+    offset, held, lag = np.zeros((r, 2, p)), np.zeros((r, p), np.int64), np.zeros((r, p), np.int64)
+    rates, lines = np.array([np.mean([e.first for e in cell]) for cell in cells]), []
     for i, cell in enumerate(cells):
-        values = np.array([e.values for e in cell])
-        offset[i], held[i], lag[i] = values.mean(axis=0), cell[0].kind[3], cell[0].kind[4]
-        var, axes = np.linalg.eigh(np.cov(values, rowvar=False, bias=True).reshape(p, p))
+        held[i], lag[i] = cell[0].kind[3], cell[0].kind[4]
+        offset[i, 1] = np.mean([e.steady for e in cell], axis=0)
+        if cell[0].kind[2] == WANDERS:
+            offset[i, 0], line, rates[i] = _wandering(cell)
+        else:
+            offset[i, 0], line = _spread(cell)
         moved = np.diag([MOVED * plant.commands[c].scale if c >= 0 else 0.0 for c in held[i]])[:, held[i] >= 0]
-        lines.append(
-            np.hstack([(axes * np.sqrt(np.maximum(var, 0.0)))[:, var > NEGLIGIBLE * max(var.max(), 1e-300)], moved])
-        )
-    direction = np.zeros((r, p, max(1, *(line.shape[1] for line in lines))))
+        lines.append(np.hstack([line, np.vstack([moved, np.zeros_like(moved)])]))
+    direction = np.zeros((r, 2 * p, max(1, *(line.shape[1] for line in lines))))
     for each, line in zip(direction, lines, strict=True):
         each[:, : line.shape[1]] = line
     size = np.array([len(cell) for cell in cells], float)
     longest = int(np.flatnonzero(lasts.over)[-1]) + 1 if lasts.over.any() else 0
+    bits = [mode.name for mode in plant.modes]
     return Events(
-        np.array(entries), np.array([cell[0].label for cell in cells]), offset, direction, held, lag,
-        np.array([cell[0].kind[2] for cell in cells]), np.array([np.mean([e.first for e in cell]) for cell in cells]),
+        np.array(entries), np.array([cell[0].kind[0] for cell in cells]),
+        np.array([sum(1 << bits.index(name) for name in cell[0].modes) for cell in cells]),
+        offset[:, 0], offset[:, 1], direction[:, :p], direction[:, p:], held, lag,
+        np.array([cell[0].kind[2] for cell in cells]), rates,
         np.array([np.mean([e.second for e in cell]) for cell in cells]), np.log(size / size.sum()),
-        first.rate(max(1, K // BINS)), again.rate(max(1, K // BINS)), lasts.rate(1)[:longest], samples / samples.sum(),
-        *_parameters(plant, scenarios),
+        first.rate(max(1, K // BINS)), again.rate(max(1, K // BINS)),
+        (_longer(begun, len(acted)) / np.maximum(acted, 1.0))[: len(begun)],
+        lasts.rate(1)[:longest], samples / samples.sum(), *_parameters(plant, scenarios),
     )  # fmt: skip
+
+
+def _longer(counts: Array, length: int) -> Array:
+    return np.pad(counts, (0, max(length - len(counts), 0)))
+
+
+def _pieces(plant: Plant, groups: Sequence[tuple[int, int, list[Fault]]]) -> list[tuple[int, int, int]]:
+    """Label, number of events that act, and length of each piece of a flight in which some do."""
+    edges = sorted({edge for onset, end, _ in groups for edge in (onset, end)})
+    found = []
+    for low, high in itertools.pairwise(edges):
+        acting = [faults for onset, end, faults in groups if onset <= low < end]
+        if acting:
+            modes = frozenset(fault.mode for faults in acting for fault in faults)
+            found.append((plant.label_of(modes), len(acting), high - low))
+    return found
+
+
+def _spread(cell: list[_Event]) -> tuple[Array, Array]:
+    """Mean (p,) of a cell's values, and along which directions (2 p, c) they and what is steady vary."""
+    values = np.array([e.values for e in cell])
+    both = values if not np.ptp([e.steady for e in cell]) else np.hstack([values, [e.steady for e in cell]])
+    var, axes = np.linalg.eigh(np.cov(both, rowvar=False, bias=True).reshape(both.shape[1], -1))
+    line = (axes * np.sqrt(np.maximum(var, 0.0)))[:, var > NEGLIGIBLE * max(var.max(), 1e-300)]
+    return values.mean(axis=0), np.pad(line, [(0, 2 * values.shape[1] - len(line)), (0, 0)])
+
+
+def _wandering(cell: list[_Event]) -> tuple[Array, Array, float]:
+    """Mean (p,), direction (2 p, 1) and correlation over a sample of values that wander, those of all events together."""
+    values = np.array([e.values for e in cell])
+    mean, j = values.mean(axis=0), int(np.argmax(np.ptp(values, axis=0)))
+    around = [e.wander - np.concatenate([e.wander for e in cell]).mean() for e in cell]
+    power = sum(float(a @ a) for a in around)
+    size, line = sum(len(a) for a in around), np.zeros((2 * len(mean), 1))
+    line[j] = np.sqrt(power / size)
+    return mean, line, sum(float(a[1:] @ a[:-1]) for a in around) / power

@@ -1,0 +1,244 @@
+"""Bayes' rule over faults that overlap: against the bank for those that do not, and against brute force."""
+
+import msgspec
+import numpy as np
+import pytest
+from conftest import build
+from numpy.testing import assert_allclose
+from scipy.stats import multivariate_normal
+
+from baselines.filters.onset_bank import Bank as OneByOne
+from baselines.filters.overlap_bank import Bank
+from fdi_gym.diagnosis import make_diagnoser, run
+from fdi_gym.diagnosis.fitting import fit_belief
+from fdi_gym.engine import simulate
+from fdi_gym.estimation.events import ALTERNATES, WANDERS, events_of
+from fdi_gym.estimation.interval import Interval
+from fdi_gym.faults import Abrupt, Fault, FaultScenario, Samples, Square, draw
+from fdi_gym.plant import NotApplicableError
+
+FIRST = 4_950_000  # seeds of neither test nor validation nor training flights
+
+
+def flight(*faults, steps=100):
+    """A flight of the Boeing."""
+    return FaultScenario(plant="B747Lateral", steps=steps, faults=list(faults))
+
+
+def rudder(onset, end=None, size=-0.5):
+    return Fault("rudder LOE", "LOE", onset, [Abrupt("gamma_rudder", size)], end)
+
+
+def aileron(onset, end=None, size=-0.5):
+    return Fault("aileron LOE", "LOE", onset, [Abrupt("gamma_aileron", size)], end)
+
+
+# -- what a process does
+
+
+def test_how_likely_another_event_begins_is_counted_by_how_many_act():
+    plant = build("B747Lateral", labels="dual")
+    both = flight(rudder(10, 60), aileron(30, 70))
+    e = events_of(plant, [both] * 30 + [flight(rudder(10, 60))] * 10, overlapping=True)
+    alone = 30 * (20 + 10) + 10 * 50  # samples at which one acts
+    assert_allclose(e.more, [30 / alone])
+    assert_allclose([e.onset[10], e.again.sum()], [1.0, 0.0])
+    labels = [plant.label_of(frozenset(names)) for names in ({"rudder LOE"}, {"aileron LOE"}, {"rudder LOE", "aileron LOE"})]
+    assert_allclose(e.share[labels] * 4000, [30 * 20 + 10 * 50, 30 * 10, 30 * 30])
+    bits = [1 << [m.name for m in plant.modes].index(name) for name in ("aileron LOE", "rudder LOE")]
+    assert sorted(e.modes.tolist()) == sorted(bits)
+
+
+def test_a_square_wave_has_a_part_that_alternates_and_one_that_stays():
+    plant = build("B747Lateral")
+    rng = np.random.default_rng(0)
+    drawn = [
+        flight(Fault("rudder LOE", "wave", 10, [Square("gamma_rudder", a + 0.2, -a + 0.2, 2.0), Abrupt("b_rudder", 3.0)]))
+        for a in rng.uniform(0.1, 0.3, 50)
+    ]
+    e = events_of(plant, drawn)
+    assert e.course.tolist() == [ALTERNATES]
+    gamma, b = (e.entries.tolist().index(plant.theta_entries.index(name)) for name in ("gamma_rudder", "b_rudder"))
+    assert_allclose([e.steady[0, gamma], e.steady[0, b], e.offset[0, b]], [0.2, 3.0, 0.0])
+    assert_allclose(e.offset[0, gamma], 0.2, atol=0.02)
+    assert_allclose(e.at(np.array([[0.5, 1.5, 2.5]])), [[1.0, -1.0, 1.0]])
+
+
+def test_values_that_wander_have_their_spread_and_correlation():
+    plant, rng, a = build("B747Lateral"), np.random.default_rng(1), 0.9
+    drawn = []
+    for _ in range(200):
+        x = np.zeros(80)
+        x[0] = rng.standard_normal()
+        for k in range(1, 80):
+            x[k] = a * x[k - 1] + np.sqrt(1 - a**2) * rng.standard_normal()
+        drawn.append(flight(Fault("rudder LOE", "drift", 10, [Samples("gamma_rudder", (0.3 + 0.1 * x).tolist())])))
+    e = events_of(plant, drawn, overlapping=True)
+    assert e.course.tolist() == [WANDERS]
+    assert_allclose(e.first, [a], atol=0.02)
+    assert_allclose([e.offset[0, 0], np.abs(e.direction[0, 0, 0])], [0.3, 0.1], atol=0.01)
+    with pytest.raises(NotApplicableError, match="no course that could be known"):
+        events_of(plant, drawn)
+
+
+# -- as the bank for events that follow one another
+
+
+def without_disturbances(plant, process="standard"):
+    """A belief of a plant on which nothing acts but its faults."""
+    belief = fit_belief(plant, process)
+    nothing = {"disturbances": np.zeros(0, np.int64), "d0": np.zeros(0), "d_walk": np.zeros(0)}
+    return msgspec.structs.replace(belief, **nothing)
+
+
+def steps_of(plant, bank, obs):
+    """The state of a bank after each sample of observations (n, K + 1, n_obs)."""
+    s = bank.start(len(obs))
+    y, u, known = plant.split(obs)
+    for k in range(obs.shape[1]):
+        at = Interval(np.full(len(obs), k), u[:, k], None, known[:, k])
+        s = bank.predict(s, at) if k else s
+        s = bank.update(s, at, y[:, k], np.ones_like(y[:, k], bool))
+        yield s
+
+
+@pytest.mark.parametrize("every", [1, 4])
+def test_where_none_overlap_it_is_the_bank_for_those(every):
+    plant = build("B747Lateral")
+    rng = np.random.default_rng(5)
+    drawn = [flight(make(int(t), int(t) + 40, -v)) for make in (rudder, aileron) for t, v in
+             zip(rng.integers(5, 50, 60), rng.uniform(0.1, 0.9, 60), strict=True)] + [flight()] * 40  # fmt: skip
+    events, belief = events_of(plant, drawn, courses=1), without_disturbances(plant)
+    special = OneByOne(plant, belief, events, 3, every)
+    general = Bank(plant, belief, events, 3, 1 + 3 * len(events.label), every)
+    flights = [flight(rudder(20, 60, -0.9)), flight(aileron(33, 73, -0.6)), flight()]
+    reference = draw(plant.process("standard"), FIRST).reference
+    obs = simulate(plant, [f.replace(noise_seed=i, reference=reference) for i, f in enumerate(flights)]).obs
+    for a, b in zip(steps_of(plant, special, obs), steps_of(plant, general, obs), strict=True):
+        one, other = special.read(a), general.read(b)
+        assert_allclose(other.probs, one.probs, atol=1e-7)
+        assert_allclose(other.z, one.z, atol=1e-6)
+        assert_allclose([b.first, b.since], [a.first, a.since], atol=1e-6)
+    assert np.asarray(one.probs).max(axis=1).min() > 0.5
+
+
+# -- Bayes by brute force
+
+
+def density(plant, bank, obs, beginnings):
+    """Log density of all measurements of a flight on which events of these kinds begin at these steps, and stay."""
+    e, model, f = bank.events, bank.model, bank.f
+    y, u, _ = plant.split(obs)
+    m, mean, P = len(model.R), model.X0.copy(), model.P0.copy()
+    means, past, S = [], [], np.zeros((len(obs) * len(model.R),) * 2)
+    order = sorted(kind for kind, _ in beginnings)
+    for k in range(len(obs)):
+        if k:
+            offset, direction = np.zeros((1, len(e.entries))), np.zeros((1, len(e.entries), bank.E * f))
+            for kind, step in beginnings:
+                own = slice(order.index(kind) * f, (order.index(kind) + 1) * f)
+                if k == step + 1:
+                    x = slice(bank.m + own.start, bank.m + own.stop)
+                    P[x, x] = np.diag(bank.M0[kind])
+                if k > step:
+                    offset[0] += e.offset[kind]
+                    direction[0, :, own] = e.direction[kind]
+            line, at = model.replace(lines=(offset, direction)), Interval(np.array([k]), u[k][None], None, np.zeros((1, 0)))
+            moved, F = line.jacobian_f(mean[None], at)
+            mean, P, past = moved[0], F[0] @ P @ F[0].T + model.Q[0], [F[0] @ c for c in past]
+        means.append(model.H @ mean)
+        rows = slice(k * m, (k + 1) * m)
+        for j, c in enumerate(past):
+            S[rows, j * m : (j + 1) * m] = model.H @ c
+            S[j * m : (j + 1) * m, rows] = (model.H @ c).T
+        S[rows, rows] = model.H @ P @ model.H.T + model.R
+        past.append(P @ model.H.T)
+    return multivariate_normal.logpdf(y[:, model.sensors].ravel(), np.concatenate(means), S)
+
+
+def test_two_that_overlap_are_bayes_by_brute_force():
+    """The first may begin at step 0, another beside it at step 20: what may have happened can be counted."""
+    plant = build("B747Lateral", labels="dual")
+    rng = np.random.default_rng(7)
+    sizes = rng.uniform(0.1, 0.9, (80, 2))
+    drawn = [flight(rudder(0, None, -a), aileron(20, None, -b), steps=40) for a, b in sizes[:40]]
+    drawn += [flight(aileron(0, None, -a), rudder(20, None, -b), steps=40) for a, b in sizes[40:]]
+    drawn += [flight(rudder(0, None, -a), steps=40) for a, _ in sizes] + [flight(steps=40)] * 40
+    events = events_of(plant, drawn, courses=1, overlapping=True)
+    bank = Bank(plant, without_disturbances(plant), events, 2, 20, 20)
+    reference = draw(plant.process("standard"), FIRST).reference
+    truth = [flight(rudder(0, None, -0.7), aileron(20, None, -0.5), steps=40), flight(aileron(0, None, -0.8), steps=40)]
+    obs = simulate(plant, [t.replace(noise_seed=i, reference=reference) for i, t in enumerate(truth)]).obs
+    *_, s = steps_of(plant, bank, obs)
+    first, late, more = events.onset[:20].sum(), events.onset[20:40].sum(), 20 * events.more[0]
+    first, late, more = (np.clip(c, 1e-12, 0.5) for c in (first, late, more))
+    prior, kinds = events.log_prior, range(len(events.label))
+    for i in range(2):
+        found = {0: [np.log1p(-first) + np.log1p(-late) + density(plant, bank, obs[i], [])]}
+        for q in kinds:
+            label = int(events.label[q])
+            once = np.log(first) + prior[q] + np.log1p(-more) + density(plant, bank, obs[i], [(q, 0)])
+            then = np.log1p(-first) + np.log(late) + prior[q] + density(plant, bank, obs[i], [(q, 20)])
+            found.setdefault(label, []).extend([once, then])
+            for other in kinds:
+                both = int(bank.labels[events.modes[q] | events.modes[other]])
+                if q != other and both >= 0:  # the only other kind: its share of those that may begin is 1
+                    weight = np.log(first) + prior[q] + np.log(more)
+                    found.setdefault(both, []).append(weight + density(plant, bank, obs[i], [(q, 0), (other, 20)]))
+        logs = {label: np.logaddexp.reduce(values) for label, values in found.items()}
+        total = np.logaddexp.reduce(list(logs.values()))
+        probs = np.asarray(bank.read(s).probs)[i]
+        assert_allclose(probs[list(logs)], [np.exp(v - total) for v in logs.values()], rtol=2e-5, atol=1e-9)
+        assert 0.01 < probs.max() < 1 - 1e-6  # the comparison says something
+
+
+def test_no_weight_is_lost_when_events_end_and_begin():
+    plant = build("HUAVHover")
+    drawn = [draw(plant.process("standard"), FIRST + i) for i in range(400)]
+    events = events_of(plant, drawn, overlapping=True)
+    bank, rng = Bank(plant, fit_belief(plant, "standard"), events, 3, 120, 1), np.random.default_rng(4)
+    s = bank.start(2)
+    u = np.tile(plant.trim_command, (2, 1))
+    for step in range(300, 400):
+        s = bank.renewed(s, np.full(2, step), u)
+        assert_allclose(np.exp(s.log).sum(axis=1), 1.0, atol=1e-4)  # the least likely give way
+        alive = s.log > -1e300
+        assert ((s.kind[:, 1:] >= 0).any(axis=2) | ~alive[:, 1:]).all()
+        rising = (s.kind[..., 0] < s.kind[..., 1]) | (s.kind[..., 1] < 0)
+        assert rising[alive].all()
+        assert (np.linalg.eigvalsh(s.P[alive]) > -1e-9).all()
+        log = np.where(alive, s.log + 0.5 * rng.standard_normal(s.log.shape), s.log)  # as if something had been measured
+        s = s._replace(log=log - np.where(alive, np.logaddexp.reduce(np.where(alive, log, -np.inf), axis=1)[:, None], 0.0))
+    assert (s.kind[..., 1] >= 0).any()
+
+
+# -- as a diagnoser
+
+
+@pytest.mark.parametrize(
+    ("plant", "process", "steps", "least"), [("HUAVHover", "standard", 1000, 0.75), ("CMGSatellite", "hard", 3000, 0.75)]
+)
+def test_it_tells_faults_apart_that_overlap(plant, process, steps, least):
+    plant = build(plant)
+    record = simulate(plant, [draw(plant.process(process), FIRST + i).replace(steps=steps) for i in range(8)])
+    valid = np.arange(record.obs.shape[1]) <= record.length[:, None]
+    said = run(make_diagnoser("overlap_bank", plant, process=process), record.obs).label
+    right = [(said[valid & (record.label == label)] == label).mean() for label in np.unique(record.label[valid])]
+    assert np.mean(right) > least
+
+
+def test_what_it_cannot_do_it_says():
+    with pytest.raises(NotApplicableError, match="no two faults overlap"):
+        make_diagnoser("overlap_bank", build("B747Lateral"), process="standard")
+    with pytest.raises(NotApplicableError, match="sensors that fail"):
+        make_diagnoser("overlap_bank", build("HUAVHover", sensor_faults=True), process="mixed")
+
+
+@pytest.mark.parametrize(
+    ("settings", "what"),
+    [({"onsets": 1}, "onsets is 2 or more"), ({"every": 0}, "every is 1 or more"), ({"filters": 9}, "filters are more than"),
+     ({"disturbance": 0.0}, "disturbance is above 0")],
+)  # fmt: skip
+def test_numbers_out_of_range_are_refused(settings, what):
+    with pytest.raises(ValueError, match=what):
+        make_diagnoser("overlap_bank", build("HUAVHover"), process="standard", **settings)
