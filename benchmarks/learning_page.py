@@ -28,6 +28,7 @@ REFERENCE = (
     "hypothesis_bank",
     "onset_bank",
     "onset_bank_fine",
+    "overlap_bank",
 )  # this package's own, of no paper
 FLOOR = ("null", "random")
 
