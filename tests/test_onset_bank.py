@@ -7,7 +7,8 @@ from conftest import build
 from numpy.testing import assert_allclose
 from scipy.stats import multivariate_normal
 
-from baselines.filters.onset_bank import Bank, merged, onset_bank
+from baselines.filters.hypotheses import merged
+from baselines.filters.onset_bank import Bank, onset_bank
 from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.diagnosis.filtering import readings
 from fdi_gym.diagnosis.fitting import fit_belief

@@ -23,9 +23,9 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from scipy.special import logsumexp
 
-from baselines.filters.onset_kernels import lines, merged, put, taken
+from baselines.filters.hypotheses import NEVER, deviations_of, known_entries, live, merged, put, taken, weighed
+from baselines.filters.onset_kernels import lines
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.diagnosis.fitting import VALIDATION_SEED, floored
 from fdi_gym.estimation.augmented import AugmentedModel, augmented, on_lines
@@ -39,7 +39,6 @@ from fdi_gym.plant import Array, NotApplicableError, Plant
 FIRST, DRAWN = 700_000, 2000  # scenarios from VALIDATION_SEED + FIRST on
 FEW = 10  # of them that show whether faults begin at different times
 GRID = 200  # onsets in a flight, where it is not said how far they are apart
-NEVER = -1e300  # log weight of a place where nothing is
 NEGLIGIBLE = -1000.0  # log weight, as a share of all, below which a filter is given up: at -100 some still come back
 
 
@@ -80,13 +79,11 @@ class Bank:
         self.model, self.r, self.count = model.replace(P0=P0), r, 1 + r * onsets
         self.M0 = np.zeros((r, f, f))
         self.M0[:, range(f), range(f)] = (events.direction != 0.0).any(axis=1) | (events.steady_direction != 0.0).any(axis=1)
-        inputs = fault_inputs(plant)
-        places = events.entries.tolist()
-        self.p = len(inputs.entries)
-        parts = events.offset, events.direction, events.steady, events.steady_direction, events.spread
-        self.deviations = tuple(contiguous(a) for a in parts)
-        known = [(j, places.index(e)) for j, e in enumerate(inputs.entries.tolist()) if e in places]
-        self.known = np.array(known, np.int64).reshape(-1, 2).T  # (2, entries): of the fault vector, of the events
+        self.p, self.known, self.deviations = (
+            len(fault_inputs(plant).entries),
+            known_entries(plant, events),
+            deviations_of(events),
+        )
 
     def start(self, n: int) -> Onsets:
         """Healthy, and nothing has begun."""
@@ -100,17 +97,20 @@ class Bank:
             np.tile(self.plant.trim_command, (n, 1)), np.zeros((n, m)), np.tile(model.R, (n, 1, 1)),
         )  # fmt: skip
 
-    def live(self, s: Onsets) -> Array:
-        """Which filters run (rows,): the healthy ones and all that have a weight, numbered through all episodes."""
-        runs = s.log > NEVER
-        runs[:, 0] = True
-        return np.flatnonzero(runs)
-
     def on(self, s: Onsets, rows: Array) -> AugmentedModel:
         """The model on the lines of these filters."""
         (_, p, f), (e, c) = self.events.direction.shape, self.events.spread.shape
         offset, direction = np.zeros((len(rows), p + e)), np.zeros((len(rows), p + e, f + c))
-        lines(rows, self.s, contiguous(s.length), contiguous(s.held), *self.deviations, offset, direction)
+        lines(
+            rows,
+            self.s,
+            contiguous(s.length),
+            contiguous(s.held),
+            *self.deviations,
+            contiguous(self.events.spread),
+            offset,
+            direction,
+        )
         return self.model.on(offset, direction)
 
     def ended(self, s: Onsets, step: Array) -> Onsets:
@@ -208,20 +208,14 @@ class Bank:
         """All filters, over the interval."""
         age = (at.k[:, None, None] - s.onset) * self.plant.dt
         s = s._replace(length=self.events.at(np.maximum(age, 0.0)), u=at.u)
-        rows = self.live(s)
+        rows = live(s.log)
         X, P = self.on(s, rows).predict("extended", taken(s.X, rows), taken(s.P, rows), at.of(rows // self.count))
         return s._replace(X=put(s.X, rows, X), P=put(s.P, rows, P))
 
     def update(self, s: Onsets, at: Interval, y: Array, seen: Array) -> Onsets:
         """Weigh and correct those that run; of those that have become negligible the place is free."""
-        rows = self.live(s)
-        of, healthy = rows // self.count, rows % self.count == 0
-        done = self.on(s, rows).update("extended", taken(s.X, rows), taken(s.P, rows), at.of(of), y[of], seen[of])
-        log = put(s.log, rows, np.maximum(taken(s.log, rows) + done.log_likelihood, NEVER))
-        log = np.where(s.log <= NEVER, NEVER, log - logsumexp(log, axis=1, keepdims=True))
-        log[:, 1:] = np.where(log[:, 1:] < NEGLIGIBLE, NEVER, log[:, 1:])
-        X, P = put(s.X, rows, done.X), put(s.P, rows, done.P)
-        return s._replace(X=X, P=P, log=log, nu=done.nu[healthy], S=done.S[healthy])
+        rows = live(s.log)
+        return weighed(self.on(s, rows), s, rows, at, y, seen, NEGLIGIBLE)
 
     def read(self, s: Onsets) -> Reading:
         """Probabilities of the labels, and the mean of the fault vector."""
@@ -234,7 +228,7 @@ class Bank:
         probs /= probs.sum(axis=1, keepdims=True)
         z, (j, at) = np.zeros((n, self.p)), self.known
         m = s.X[:, 1:, self.m].reshape(n, self.r, self.s, -1, 1)
-        offset, direction, steady, steady_direction = (a[:, None, at] for a in self.deviations[:4])
+        offset, direction, steady, steady_direction = (a[:, None, at] for a in self.deviations)
         along, beside = offset + (direction @ m)[..., 0], steady + (steady_direction @ m)[..., 0]
         theta = s.length[..., None] * along + s.held[..., at] + beside  # (n, r, s, entries)
         z[:, j] = (w[:, 1:, None] * theta.reshape(n, self.count - 1, len(at))).sum(axis=1)

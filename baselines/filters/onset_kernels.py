@@ -1,39 +1,12 @@
-"""What the onset bank does with all its filters at once: their lines, mixtures of them, and the rows of those that run."""
+"""The lines of the onset bank's filters."""
 
 from __future__ import annotations
 
-import numpy as np
 from numba import float64, int64, void
-from scipy.special import logsumexp
 
-from fdi_gym.estimation.mixing import mixture
 from fdi_gym.kernels import M, compiled
-from fdi_gym.plant import Array
 
 M3, M4 = float64[:, :, ::1], float64[:, :, :, ::1]
-
-
-def merged(log: Array, X: Array, P: Array) -> tuple[Array, Array, Array]:
-    """Log weight (a,), mean (a, N) and covariance (a, N, N) of the mixtures of log (a, b), X (a, b, N), P (a, b, N, N)."""
-    total = np.asarray(logsumexp(log, axis=1))
-    w = np.exp(log - total[:, None])[:, None]
-    mean, covariance = mixture(w, X, P)
-    return total, mean[:, 0], covariance[:, 0]
-
-
-def taken(table: Array, rows: Array) -> Array:
-    """Some rows of a table (n, count, ...), numbered through; the table itself where those are all."""
-    flat = table.reshape(-1, *table.shape[2:])
-    return flat if len(rows) == len(flat) else flat[rows]
-
-
-def put(table: Array, rows: Array, values: Array) -> Array:
-    """The table (n, count, ...) with other values in these rows."""
-    if len(rows) == table.shape[0] * table.shape[1]:
-        return values.reshape(table.shape)
-    found = table.copy()
-    found.reshape(-1, *table.shape[2:])[rows] = values
-    return found
 
 
 @compiled(void(int64[::1], int64, M3, M4, M, M3, M, M3, M, M, M3))

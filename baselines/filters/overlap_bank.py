@@ -19,11 +19,10 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from scipy.special import logsumexp
 
+from baselines.filters.hypotheses import NEVER, deviations_of, known_entries, live, put, taken, weighed
 from baselines.filters.onset_bank import events_of_process, most_telling
-from baselines.filters.onset_kernels import put, taken
-from baselines.filters.overlap_kernels import NEVER, lines, renew, wander
+from baselines.filters.overlap_kernels import lines, renew, wander
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.estimation.augmented import AugmentedModel, augmented, on_lines
 from fdi_gym.estimation.belief import Belief, fault_inputs
@@ -71,15 +70,12 @@ class Bank:
         for i, label in enumerate(plant.labels):
             self.labels[sum(1 << names.index(name) for name in label.modes)] = i
         self.stays = np.concatenate([[0.0], np.cumsum(np.log1p(-np.minimum(events.end, 1 - 1e-12)))])
-        self.deviations = tuple(
-            contiguous(a) for a in (events.offset, events.direction, events.steady, events.steady_direction)
-        )
         self.rates = np.where(events.course == WANDERS, events.first, 1.0)
-        places = events.entries.tolist()
-        entries = fault_inputs(plant).entries.tolist()
-        self.p = len(entries)
-        known = [(j, places.index(e)) for j, e in enumerate(entries) if e in places]
-        self.known = np.array(known, np.int64).reshape(-1, 2).T  # (2, entries): of the fault vector, of the events
+        self.p, self.known, self.deviations = (
+            len(fault_inputs(plant).entries),
+            known_entries(plant, events),
+            deviations_of(events),
+        )
 
     def start(self, n: int) -> Hypotheses:
         """Healthy, and nothing has begun."""
@@ -92,12 +88,6 @@ class Bank:
             np.zeros(n), np.ones(shape), np.tile(self.plant.trim_command, (n, 1)), np.zeros((n, m)),
             np.tile(model.R, (n, 1, 1)),
         )  # fmt: skip
-
-    def live(self, s: Hypotheses) -> Array:
-        """Which filters run (rows,): the healthy ones and all that have a weight, numbered through all episodes."""
-        runs = s.log > NEVER
-        runs[:, 0] = True
-        return np.flatnonzero(runs)
 
     def on(self, s: Hypotheses, rows: Array) -> AugmentedModel:
         """The model on the lines of these filters."""
@@ -146,7 +136,7 @@ class Bank:
                 a[turn] = new
         age = np.maximum(at.k[:, None, None] - s.onset, 0.0) * self.plant.dt
         s = s._replace(u=at.u, length=contiguous(self.events.of(np.maximum(s.kind, 0), age)))
-        rows = self.live(s)
+        rows = live(s.log)
         X, P = self.on(s, rows).predict("extended", taken(s.X, rows), taken(s.P, rows), at.of(rows // self.count))
         if (self.rates < 1.0).any():
             wander(rows, s.kind, self.rates, self.m, self.f, X, P)
@@ -154,14 +144,8 @@ class Bank:
 
     def update(self, s: Hypotheses, at: Interval, y: Array, seen: Array) -> Hypotheses:
         """Weigh and correct those that run; of those that have become negligible the place is free."""
-        rows = self.live(s)
-        of, healthy = rows // self.count, rows % self.count == 0
-        done = self.on(s, rows).update("extended", taken(s.X, rows), taken(s.P, rows), at.of(of), y[of], seen[of])
-        log = put(s.log, rows, np.maximum(taken(s.log, rows) + done.log_likelihood, NEVER))
-        log = np.where(s.log <= NEVER, NEVER, log - logsumexp(log, axis=1, keepdims=True))
-        log[:, 1:] = np.where(log[:, 1:] < GIVEN_UP, NEVER, log[:, 1:])
-        X, P = put(s.X, rows, done.X), put(s.P, rows, done.P)
-        return s._replace(X=X, P=P, log=log, nu=done.nu[healthy], S=done.S[healthy])
+        rows = live(s.log)
+        return weighed(self.on(s, rows), s, rows, at, y, seen, GIVEN_UP)
 
     def read(self, s: Hypotheses) -> Reading:
         """Probabilities of the labels, and the mean of the fault vector."""

@@ -10,11 +10,11 @@ from __future__ import annotations
 import numpy as np
 from numba import float64, int64, void
 
+from baselines.filters.hypotheses import NEVER
 from fdi_gym.kernels import M, V, compiled, helper
 
 I1, I3 = int64[::1], int64[:, :, ::1]
 M3, M4 = float64[:, :, ::1], float64[:, :, :, ::1]
-NEVER = -1e300  # log weight of a row where nothing is
 NEGLIGIBLE = (
     40.0  # log of a share of an episode's likeliest hypothesis below which nothing begins from others than the healthy
 )

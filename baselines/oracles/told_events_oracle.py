@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.filters.onset_bank import NEVER, Bank, Onsets, events_of_process, most_telling
+from baselines.filters.hypotheses import NEVER
+from baselines.filters.onset_bank import Bank, Onsets, events_of_process, most_telling
 from baselines.oracles.told_onset_ekf import label_changes
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.estimation.belief import Belief
