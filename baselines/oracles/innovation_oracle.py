@@ -1,11 +1,12 @@
-"""Bayesian reference that knows when a fault acts, but not which: the ceiling of the missile's tables.
+"""Bayesian reference of the missile that knows when a fault acts, but not which.
 
 A filter of the nominal, healthy model produces innovations; `innovation_evidence` says what they tell. The label with the
 largest evidence is the answer. A jam changes the model too much for that and has a filter of its own, whose fin stands
 where it was at the onset.
 
-It linearises and uses Gaussian priors: a good reference, not a strict bound. It is no diagnoser, since it is told the
-times."""
+It linearises and uses Gaussian priors: a good reference, and no ceiling. Bayes' rule with filters that are told nothing of
+the times (`onset_bank_fine`) is above it where faults come and go; told them too (`told_events_oracle`) it frames the tables.
+"""
 
 from __future__ import annotations
 
@@ -192,7 +193,6 @@ def most_probable() -> Rule:
     "innovation_oracle",
     "Evidence of the innovations under the process's priors, within the known windows of faults",
     knows="when each fault begins and ends",
-    ceiling=True,
 )
 def innovation_oracle(
     plant: Plant, *, scenarios: Sequence[FaultScenario], hard: bool = False, every: int = 1, none_allowed: bool = True
