@@ -529,7 +529,7 @@ def test_builders_fly_nothing_and_say_why_they_cannot(monkeypatch, plant_id, nam
         or name in FAMILY
         or re.search(
             "needs a linear plant|no trained weights|no label of|no unknown-input observer|are allowed|too much|"
-            "three tanks only|overlap in time",
+            "three tanks only|overlap in time|no two faults overlap",
             reason,
         )
     ), reason

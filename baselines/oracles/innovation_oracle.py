@@ -5,7 +5,7 @@ largest evidence is the answer. A jam changes the model too much for that and ha
 where it was at the onset.
 
 It linearises and uses Gaussian priors: a good reference, and no ceiling. Bayes' rule with filters that are told nothing of
-the times (`onset_bank_fine`) is above it where faults come and go; told them too (`told_events_oracle`) it frames the tables.
+the times (`onset_bank_fine`) is above it where faults come and go; told them (`told_events_oracle`) it frames the tables.
 """
 
 from __future__ import annotations

@@ -106,6 +106,11 @@ def _groups(scenario: FaultScenario) -> list[tuple[int, int, list[Fault]]]:
     return [(onset, end, faults) for (onset, end), faults in sorted(found.items())]
 
 
+def _overlap(groups: Sequence[tuple[int, int, list[Fault]]]) -> bool:
+    """Whether an event begins while another acts."""
+    return any(later[0] < earlier[1] for earlier, later in itertools.pairwise(groups))
+
+
 def _event(plant: Plant, entries: list[int], faults: list[Fault], wandering: bool) -> _Event:
     names, nominal = plant.theta_entries, plant.nominal_theta
     values, steady, held, lag = np.zeros(len(entries)), np.zeros(len(entries)), [-1] * len(entries), [0] * len(entries)
@@ -188,6 +193,8 @@ def events_of(
     Raises:
         NotApplicableError: Events overlap, or a fault has no course that could be known.
     """
+    if not overlapping and any(_overlap(_groups(scenario)) for scenario in scenarios):
+        raise NotApplicableError("faults of this process overlap in time: it has no events one after the other")
     names = plant.theta_entries
     entries = sorted({names.index(e.entry) for s in scenarios for fault in s.faults for e in fault.effects})
     K, labels = max(s.steps for s in scenarios), len(plant.labels)
@@ -198,8 +205,6 @@ def events_of(
         groups, free, acting = _groups(scenario), 0, []  # free: since when; acting: ends of those that act
         for onset, end, faults in groups:
             acting = [other for other in acting if other > onset]
-            if acting and not overlapping:
-                raise NotApplicableError("faults of this process overlap in time: it has no events one after the other")
             event = _event(plant, entries, faults, overlapping)
             kinds.setdefault(event.kind, []).append(event)
             if acting:
