@@ -1,11 +1,13 @@
 """Bayes' rule over onset, kind and size: against brute force, and what it counts in a process."""
 
+import functools
+
 import msgspec
 import numpy as np
 import pytest
+from brute_force import log_density, states
 from conftest import build
 from numpy.testing import assert_allclose
-from scipy.stats import multivariate_normal
 
 from baselines.filters.hypotheses import merged
 from baselines.filters.onset_bank import Bank, onset_bank
@@ -178,47 +180,15 @@ def b747_ends():
 
 def brute_force(plant, bank, obs, every):
     """Log of p(healthy) and of each kind, from the joint density of all measurements under each kind and onset."""
-    e, model = bank.events, bank.model
-    y, u, _ = plant.split(obs)
-    K = len(obs) - 1
-    m = len(model.R)
-
-    def density(kind, onset):
-        """Mean and covariance of everything measured, stacked, by propagating the joint Gaussian of all states."""
-        mean, P = model.X0.copy(), model.P0.copy()
-        means, past = [], []  # past: covariance of the present state with each measurement
-        S = np.zeros(((K + 1) * m, (K + 1) * m))
-        for k in range(K + 1):
-            if k:
-                offset, direction = np.zeros((1, len(e.entries))), np.zeros((1, *e.direction.shape[1:]))
-                if kind is not None and k > onset:
-                    if k == onset + 1:
-                        mean[bank.m] = 0.0
-                        P[bank.m, :] = P[:, bank.m] = 0.0
-                        P[bank.m, bank.m] = bank.M0[kind]
-                        for c in past:
-                            c[bank.m] = 0.0
-                    offset, direction = e.offset[kind][None], e.direction[kind][None]
-                at = Interval(np.array([k]), u[k][None], None, np.zeros((1, 0)))
-                line = model.replace(lines=(offset, direction))
-                moved, F = line.jacobian_f(mean[None], at)
-                mean, P, past = moved[0], F[0] @ P @ F[0].T + model.Q[0], [F[0] @ c for c in past]
-            H = model.H
-            means.append(H @ mean)
-            for j, c in enumerate(past):
-                S[k * m : (k + 1) * m, j * m : (j + 1) * m] = H @ c
-                S[j * m : (j + 1) * m, k * m : (k + 1) * m] = (H @ c).T
-            S[k * m : (k + 1) * m, k * m : (k + 1) * m] = H @ P @ H.T + model.R
-            past.append(P @ H.T)
-        return multivariate_normal.logpdf(y[:, model.sensors].ravel(), np.concatenate(means), S)  # type: ignore[arg-type]
-
+    e, K = bank.events, len(obs) - 1
+    density = functools.partial(log_density, plant, bank.model, e, obs)
     free, by_kind = 0.0, np.full((len(e.label), 0), 0.0)
     for step in range(0, K, every):
         rate = e.onset[step : step + every].sum()
-        each = [free + np.log(max(rate, 1e-12)) + e.log_prior[r] + density(r, step) for r in range(len(e.label))]
+        each = [free + np.log(max(rate, 1e-12)) + e.log_prior[r] + density([(r, step)]) for r in range(len(e.label))]
         by_kind = np.column_stack([by_kind, each])
         free += np.log1p(-max(rate, 1e-12))
-    return free + density(None, 0), np.logaddexp.reduce(by_kind, axis=1)
+    return free + density([]), np.logaddexp.reduce(by_kind, axis=1)
 
 
 def test_it_is_bayes_by_brute_force_where_all_onsets_are_kept():
@@ -236,12 +206,7 @@ def test_it_is_bayes_by_brute_force_where_all_onsets_are_kept():
     bank = Bank(plant, belief, events, 40 // every + 1, every)
     flights = [b747(40, onset=12, effect=Abrupt("gamma_rudder", -0.9)).replace(noise_seed=i) for i in range(2)]
     record = simulate(plant, [s.replace(reference=draw(plant.process("standard"), FIRST).reference) for s in flights])
-    s = bank.start(2)
-    y, u, known = plant.split(record.obs)
-    for k in range(41):
-        at = Interval(np.full(2, k), u[:, k], None, known[:, k])
-        s = bank.predict(s, at) if k else s
-        s = bank.update(s, at, y[:, k], np.ones_like(y[:, k], bool))
+    *_, s = states(plant, bank, record.obs)
     for i in range(2):
         healthy, kinds = brute_force(plant, bank, record.obs[i], every)
         logs = np.array([healthy, *kinds])

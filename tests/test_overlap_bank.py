@@ -1,11 +1,13 @@
 """Bayes' rule over faults that overlap: against the bank for those that do not, and against brute force."""
 
+import functools
+
 import msgspec
 import numpy as np
 import pytest
+from brute_force import log_density, states
 from conftest import build
 from numpy.testing import assert_allclose
-from scipy.stats import multivariate_normal
 
 from baselines.filters.onset_bank import Bank as OneByOne
 from baselines.filters.overlap_bank import Bank
@@ -13,7 +15,6 @@ from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.diagnosis.fitting import fit_belief
 from fdi_gym.engine import simulate
 from fdi_gym.estimation.events import ALTERNATES, WANDERS, events_of
-from fdi_gym.estimation.interval import Interval
 from fdi_gym.faults import Abrupt, Fault, FaultScenario, Samples, Square, draw
 from fdi_gym.plant import NotApplicableError
 
@@ -91,17 +92,6 @@ def without_disturbances(plant, process="standard"):
     return msgspec.structs.replace(belief, **nothing)
 
 
-def steps_of(plant, bank, obs):
-    """The state of a bank after each sample of observations (n, K + 1, n_obs)."""
-    s = bank.start(len(obs))
-    y, u, known = plant.split(obs)
-    for k in range(obs.shape[1]):
-        at = Interval(np.full(len(obs), k), u[:, k], None, known[:, k])
-        s = bank.predict(s, at) if k else s
-        s = bank.update(s, at, y[:, k], np.ones_like(y[:, k], bool))
-        yield s
-
-
 @pytest.mark.parametrize("every", [1, 4])
 def test_where_none_overlap_it_is_the_bank_for_those(every):
     plant = build("B747Lateral")
@@ -114,7 +104,7 @@ def test_where_none_overlap_it_is_the_bank_for_those(every):
     flights = [flight(rudder(20, 60, -0.9)), flight(aileron(33, 73, -0.6)), flight()]
     reference = draw(plant.process("standard"), FIRST).reference
     obs = simulate(plant, [f.replace(noise_seed=i, reference=reference) for i, f in enumerate(flights)]).obs
-    for a, b in zip(steps_of(plant, special, obs), steps_of(plant, general, obs), strict=True):
+    for a, b in zip(states(plant, special, obs), states(plant, general, obs), strict=True):
         one, other = special.read(a), general.read(b)
         assert_allclose(other.probs, one.probs, atol=1e-7)
         assert_allclose(other.z, one.z, atol=1e-6)
@@ -123,37 +113,6 @@ def test_where_none_overlap_it_is_the_bank_for_those(every):
 
 
 # -- Bayes by brute force
-
-
-def density(plant, bank, obs, beginnings):
-    """Log density of all measurements of a flight on which events of these kinds begin at these steps, and stay."""
-    e, model, f = bank.events, bank.model, bank.f
-    y, u, _ = plant.split(obs)
-    m, mean, P = len(model.R), model.X0.copy(), model.P0.copy()
-    means, past, S = [], [], np.zeros((len(obs) * len(model.R),) * 2)
-    order = sorted(kind for kind, _ in beginnings)
-    for k in range(len(obs)):
-        if k:
-            offset, direction = np.zeros((1, len(e.entries))), np.zeros((1, len(e.entries), bank.E * f))
-            for kind, step in beginnings:
-                own = slice(order.index(kind) * f, (order.index(kind) + 1) * f)
-                if k == step + 1:
-                    x = slice(bank.m + own.start, bank.m + own.stop)
-                    P[x, x] = np.diag(bank.M0[kind])
-                if k > step:
-                    offset[0] += e.offset[kind]
-                    direction[0, :, own] = e.direction[kind]
-            line, at = model.replace(lines=(offset, direction)), Interval(np.array([k]), u[k][None], None, np.zeros((1, 0)))
-            moved, F = line.jacobian_f(mean[None], at)
-            mean, P, past = moved[0], F[0] @ P @ F[0].T + model.Q[0], [F[0] @ c for c in past]
-        means.append(model.H @ mean)
-        rows = slice(k * m, (k + 1) * m)
-        for j, c in enumerate(past):
-            S[rows, j * m : (j + 1) * m] = model.H @ c
-            S[j * m : (j + 1) * m, rows] = (model.H @ c).T
-        S[rows, rows] = model.H @ P @ model.H.T + model.R
-        past.append(P @ model.H.T)
-    return multivariate_normal.logpdf(y[:, model.sensors].ravel(), np.concatenate(means), S)
 
 
 def test_two_that_overlap_are_bayes_by_brute_force():
@@ -169,22 +128,23 @@ def test_two_that_overlap_are_bayes_by_brute_force():
     reference = draw(plant.process("standard"), FIRST).reference
     truth = [flight(rudder(0, None, -0.7), aileron(20, None, -0.5), steps=40), flight(aileron(0, None, -0.8), steps=40)]
     obs = simulate(plant, [t.replace(noise_seed=i, reference=reference) for i, t in enumerate(truth)]).obs
-    *_, s = steps_of(plant, bank, obs)
+    *_, s = states(plant, bank, obs)
     first, late, more = events.onset[:20].sum(), events.onset[20:40].sum(), 20 * events.more[0]
     first, late, more = (np.clip(c, 1e-12, 0.5) for c in (first, late, more))
     prior, kinds = events.log_prior, range(len(events.label))
     for i in range(2):
-        found = {0: [np.log1p(-first) + np.log1p(-late) + density(plant, bank, obs[i], [])]}
+        density = functools.partial(log_density, plant, bank.model, events, obs[i])
+        found = {0: [np.log1p(-first) + np.log1p(-late) + density([])]}
         for q in kinds:
             label = int(events.label[q])
-            once = np.log(first) + prior[q] + np.log1p(-more) + density(plant, bank, obs[i], [(q, 0)])
-            then = np.log1p(-first) + np.log(late) + prior[q] + density(plant, bank, obs[i], [(q, 20)])
+            once = np.log(first) + prior[q] + np.log1p(-more) + density([(q, 0)])
+            then = np.log1p(-first) + np.log(late) + prior[q] + density([(q, 20)])
             found.setdefault(label, []).extend([once, then])
             for other in kinds:
                 both = int(bank.labels[events.modes[q] | events.modes[other]])
                 if q != other and both >= 0:  # the only other kind: its share of those that may begin is 1
                     weight = np.log(first) + prior[q] + np.log(more)
-                    found.setdefault(both, []).append(weight + density(plant, bank, obs[i], [(q, 0), (other, 20)]))
+                    found.setdefault(both, []).append(weight + density([(q, 0), (other, 20)]))
         logs = {label: np.logaddexp.reduce(values) for label, values in found.items()}
         total = np.logaddexp.reduce(list(logs.values()))
         probs = np.asarray(bank.read(s).probs)[i]
