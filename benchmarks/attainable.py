@@ -40,8 +40,9 @@ SETTINGS = {  # of the first of these methods that can run
         {"every": 1, "onsets": 10},
     ],
     "overlap_bank": [
-        {"onsets": 2, "filters": 100},
+        {"filters": 60},
         {},
+        {"onsets": 4, "filters": 200},
         {"onsets": 8, "filters": 400},
         {"courses": 5},
         {"sizes": 2},

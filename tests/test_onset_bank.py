@@ -9,8 +9,8 @@ from brute_force import log_density, states
 from conftest import build
 from numpy.testing import assert_allclose
 
-from baselines.filters.hypotheses import merged
-from baselines.filters.onset_bank import Bank, onset_bank
+from baselines.filters.event_bank import Bank
+from baselines.filters.onset_bank import onset_bank
 from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.diagnosis.filtering import readings
 from fdi_gym.diagnosis.fitting import fit_belief
@@ -19,7 +19,7 @@ from fdi_gym.estimation import gaussian
 from fdi_gym.estimation.augmented import augmented, on_lines
 from fdi_gym.estimation.events import RISES, SATURATES, events_of
 from fdi_gym.estimation.interval import Interval
-from fdi_gym.faults import Abrupt, Fault, FaultScenario, Hold, Incipient, Intermittent, Ramp, Samples, draw
+from fdi_gym.faults import Abrupt, Fault, FaultScenario, Hold, Incipient, Intermittent, Ramp, draw
 from fdi_gym.plant import NotApplicableError
 
 FIRST = 4_900_000  # seeds of neither test nor validation nor training flights
@@ -92,28 +92,22 @@ def test_parameters_that_vary_are_found_with_their_covariance():
     drawn = [draw(plant.process("standard"), FIRST + i) for i in range(300)]
     e = events_of(plant, drawn)
     rho = np.array([plant.physical(s.physical) for s in drawn])[:, e.physical] - plant.nominal_p[e.physical]
-    assert_allclose(e.spread @ e.spread.T, rho.T @ rho / len(rho), atol=1e-12)
+    assert_allclose(e.mean, rho.mean(axis=0))
+    assert_allclose(e.spread @ e.spread.T, np.cov(rho, rowvar=False, bias=True), atol=1e-12)
     assert len(e.physical) == 6
     assert RISES not in e.course
 
 
-@pytest.mark.parametrize(
-    ("faults", "what"),
-    [
-        ([], "has no faults"),
-        ([Fault("rudder LOE", "LOE", 10, [Samples("gamma_rudder", [-0.1, -0.2])])], "no course that could be known"),
-        (
-            [
-                Fault("rudder LOE", "LOE", 10, [Abrupt("gamma_rudder", -0.5)]),
-                Fault("aileron LOE", "LOE", 20, [Abrupt("gamma_aileron", -0.5)]),
-            ],
-            "overlap in time",
-        ),
-    ],
-)
-def test_what_has_no_events_is_refused(faults, what):
-    with pytest.raises(NotApplicableError, match=what):
-        events_of(build("B747Lateral"), [b747().replace(faults=faults)])
+def test_parameters_that_are_off_in_all_flights_alike_are_known():
+    plant = build("HUAVHover")
+    e = events_of(plant, [draw(plant.process("hard"), FIRST + i) for i in range(100)])
+    assert_allclose(e.mean, plant.physical({"kappa": 1.0})[e.physical] - plant.nominal_p[e.physical])
+    assert e.spread.shape == (3, 0)
+
+
+def test_a_process_without_faults_has_no_events():
+    with pytest.raises(NotApplicableError, match="has no faults"):
+        events_of(build("B747Lateral"), [b747()])
 
 
 # -- the model
@@ -153,18 +147,6 @@ def test_other_lines_are_those_of_a_model_that_is_bound_anew():
     for a, b in zip(found, expected, strict=True):
         assert np.array_equal(a, b)
     assert not np.array_equal(found[0], model.predict("extended", X, P, at)[0])
-
-
-def test_a_mixture_has_the_mean_and_covariance_of_its_parts():
-    rng = np.random.default_rng(2)
-    log, X = rng.standard_normal((3, 5)), rng.standard_normal((3, 5, 2))
-    P = np.array([[np.cov(rng.standard_normal((2, 9))) for _ in range(5)] for _ in range(3)])
-    total, mean, covariance = merged(log, X, P)
-    w = np.exp(log) / np.exp(log).sum(axis=1, keepdims=True)
-    assert_allclose(np.exp(total), np.exp(log).sum(axis=1))
-    assert_allclose(mean, np.einsum("ab,abi->ai", w, X))
-    second = np.einsum("ab,abij->aij", w, P + X[..., :, None] * X[..., None, :])
-    assert_allclose(covariance, second - mean[..., :, None] * mean[..., None, :])
 
 
 @pytest.fixture
@@ -219,13 +201,44 @@ def test_it_is_bayes_by_brute_force_where_all_onsets_are_kept():
 def test_events_that_end_give_their_weight_to_health_and_what_was_never_faulty_keeps_its_own(b747_ends):
     """No weight is lost, and the end of an event makes no flight one without any event so far."""
     bank, rng = b747_ends, np.random.default_rng(4)
-    s = bank.start(5)
-    log, step = np.log(rng.dirichlet(np.ones(s.log.shape[1]), 5)), np.full(5, 60)
-    s = s._replace(log=log, onset=rng.integers(0, 6, s.onset.shape) * 10.0, first=rng.uniform(0.2, 0.8, 5))
-    after = bank.ended(s, step)
+    s, step = bank.start(5), np.full(5, 60)
+    log = np.log(rng.dirichlet(np.ones(s.log.shape[1]), 5))
+    kind, onset = np.zeros_like(s.kind), rng.integers(0, 6, s.onset.shape) * 10.0
+    kind[:, 0] = -1
+    s = s._replace(log=log, kind=kind, onset=onset, first=rng.uniform(0.2, 0.8, 5))
+    after = bank.renewed(s, step, np.tile(bank.plant.trim_command, (5, 1)))
     assert_allclose(np.exp(after.log).sum(axis=1), 1.0)
-    assert (after.log[:, 0] > log[:, 0]).all()
-    assert_allclose(after.first * np.exp(after.log[:, 0]), s.first * np.exp(log[:, 0]))
+    healthy = np.exp(after.log[:, 0]) / (1.0 - bank.chances(s._replace(first=after.first, since=after.since), step)[:, 0])
+    assert (healthy > np.exp(log[:, 0])).all()
+    assert_allclose(after.first * healthy, s.first * np.exp(log[:, 0]), rtol=1e-6)
+
+
+def test_a_mixture_of_two_onsets_has_the_mean_and_covariance_of_its_parts(b747_ends):
+    """A kind has as many onsets as are kept: as one more begins, two become one."""
+    bank, rng = b747_ends, np.random.default_rng(2)
+    s = bank.start(1)
+    N, count = s.X.shape[2], bank.count
+    roots = rng.standard_normal((count, N, N))
+    X, P = rng.standard_normal((1, count, N)), (roots @ np.swapaxes(roots, 1, 2))[None]
+    log, onset = np.log(rng.dirichlet(np.ones(count)))[None], np.arange(count)[None, :, None] * 10.0
+    kind = np.zeros_like(s.kind)
+    kind[:, 0] = -1
+    s = s._replace(X=X, P=P, log=log, kind=kind, onset=onset)
+    step = np.array([200])
+    after, _ = bank.begun(s, step, np.tile(bank.plant.trim_command, (1, 1)), np.array([[0.1]]), np.zeros(0))
+    w = np.exp(log[0])
+    mine = np.flatnonzero(~np.isin(np.exp(after.log[0]).round(12), w.round(12)))
+    both = [i for i in mine if i > 0 and after.onset[0, i, 0] < 200]
+    assert len(both) == 1
+    lost = [i for i in range(1, count) if not np.isclose(np.exp(after.log[0]), w[i], rtol=1e-9).any()]
+    assert len(lost) == 2
+    share = w[lost] / w[lost].sum()
+    mean = share @ X[0, lost]
+    second = np.einsum("a,aij->ij", share, P[0, lost] + X[0, lost][:, :, None] * X[0, lost][:, None, :])
+    assert_allclose(np.exp(after.log[0, both[0]]), w[lost].sum())
+    assert_allclose(after.X[0, both[0]], mean)
+    assert_allclose(after.P[0, both[0]], second - np.outer(mean, mean), rtol=1e-9, atol=1e-9)
+    assert_allclose(after.onset[0, both[0], 0], share @ onset[0, lost, 0])
 
 
 # -- as a diagnoser
@@ -286,7 +299,7 @@ def test_held_commands_are_those_at_the_onset():
 @pytest.mark.parametrize(
     ("settings", "what"),
     [({"onsets": 1}, "onsets is 2 or more"), ({"courses": 0}, "courses is 1 or more"), ({"sizes": 0}, "sizes is 1"),
-     ({"every": 0}, "every is a sample or more")],
+     ({"every": 0}, "every is 1 or more")],
 )  # fmt: skip
 def test_numbers_out_of_range_are_refused(settings, what):
     with pytest.raises(ValueError, match=what):
@@ -306,3 +319,8 @@ def test_a_process_that_says_when_faults_begin_is_none_to_be_told(plant_id):
     assert len({tuple(f.onset for f in plant.draw("paper", seed).faults) for seed in range(5)}) == 1
     with pytest.raises(NotApplicableError, match="at the same time in all flights"):
         onset_bank(plant, fit_belief(plant, "paper"), "paper")
+
+
+def test_faults_that_overlap_are_for_the_other_bank():
+    with pytest.raises(NotApplicableError, match="overlap in time: overlap_bank"):
+        make_diagnoser("onset_bank", build("HUAVHover"), process="standard")

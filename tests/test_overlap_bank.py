@@ -1,4 +1,4 @@
-"""Bayes' rule over faults that overlap: against the bank for those that do not, and against brute force."""
+"""Bayes' rule over faults that overlap: against brute force, and what it counts in a process."""
 
 import functools
 
@@ -9,8 +9,7 @@ from brute_force import log_density, states
 from conftest import build
 from numpy.testing import assert_allclose
 
-from baselines.filters.onset_bank import Bank as OneByOne
-from baselines.filters.overlap_bank import Bank
+from baselines.filters.event_bank import Bank
 from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.diagnosis.fitting import fit_belief
 from fdi_gym.engine import simulate
@@ -40,7 +39,7 @@ def aileron(onset, end=None, size=-0.5):
 def test_how_likely_another_event_begins_is_counted_by_how_many_act():
     plant = build("B747Lateral", labels="dual")
     both = flight(rudder(10, 60), aileron(30, 70))
-    e = events_of(plant, [both] * 30 + [flight(rudder(10, 60))] * 10, overlapping=True)
+    e = events_of(plant, [both] * 30 + [flight(rudder(10, 60))] * 10)
     alone = 30 * (20 + 10) + 10 * 50  # samples at which one acts
     assert_allclose(e.more, [30 / alone])
     assert_allclose([e.onset[10], e.again.sum()], [1.0, 0.0])
@@ -74,15 +73,11 @@ def test_values_that_wander_have_their_spread_and_correlation():
         for k in range(1, 80):
             x[k] = a * x[k - 1] + np.sqrt(1 - a**2) * rng.standard_normal()
         drawn.append(flight(Fault("rudder LOE", "drift", 10, [Samples("gamma_rudder", (0.3 + 0.1 * x).tolist())])))
-    e = events_of(plant, drawn, overlapping=True)
+    e = events_of(plant, drawn)
     assert e.course.tolist() == [WANDERS]
     assert_allclose(e.first, [a], atol=0.02)
     assert_allclose([e.offset[0, 0], np.abs(e.direction[0, 0, 0])], [0.3, 0.1], atol=0.01)
-    with pytest.raises(NotApplicableError, match="no course that could be known"):
-        events_of(plant, drawn)
-
-
-# -- as the bank for events that follow one another
+    assert np.abs(e.direction[0]).sum() == np.abs(e.direction[0, 0, 0])
 
 
 def without_disturbances(plant, process="standard"):
@@ -90,26 +85,6 @@ def without_disturbances(plant, process="standard"):
     belief = fit_belief(plant, process)
     nothing = {"disturbances": np.zeros(0, np.int64), "d0": np.zeros(0), "d_walk": np.zeros(0)}
     return msgspec.structs.replace(belief, **nothing)
-
-
-@pytest.mark.parametrize("every", [1, 4])
-def test_where_none_overlap_it_is_the_bank_for_those(every):
-    plant = build("B747Lateral")
-    rng = np.random.default_rng(5)
-    drawn = [flight(make(int(t), int(t) + 40, -v)) for make in (rudder, aileron) for t, v in
-             zip(rng.integers(5, 50, 60), rng.uniform(0.1, 0.9, 60), strict=True)] + [flight()] * 40  # fmt: skip
-    events, belief = events_of(plant, drawn, courses=1), without_disturbances(plant)
-    special = OneByOne(plant, belief, events, 3, every)
-    general = Bank(plant, belief, events, 3, 1 + 3 * len(events.label), every)
-    flights = [flight(rudder(20, 60, -0.9)), flight(aileron(33, 73, -0.6)), flight()]
-    reference = draw(plant.process("standard"), FIRST).reference
-    obs = simulate(plant, [f.replace(noise_seed=i, reference=reference) for i, f in enumerate(flights)]).obs
-    for a, b in zip(states(plant, special, obs), states(plant, general, obs), strict=True):
-        one, other = special.read(a), general.read(b)
-        assert_allclose(other.probs, one.probs, atol=1e-7)
-        assert_allclose(other.z, one.z, atol=1e-6)
-        assert_allclose([b.first, b.since], [a.first, a.since], atol=1e-6)
-    assert np.asarray(one.probs).max(axis=1).min() > 0.5
 
 
 # -- Bayes by brute force
@@ -123,7 +98,7 @@ def test_two_that_overlap_are_bayes_by_brute_force():
     drawn = [flight(rudder(0, None, -a), aileron(20, None, -b), steps=40) for a, b in sizes[:40]]
     drawn += [flight(aileron(0, None, -a), rudder(20, None, -b), steps=40) for a, b in sizes[40:]]
     drawn += [flight(rudder(0, None, -a), steps=40) for a, _ in sizes] + [flight(steps=40)] * 40
-    events = events_of(plant, drawn, courses=1, overlapping=True)
+    events = events_of(plant, drawn, courses=1)
     bank = Bank(plant, without_disturbances(plant), events, 2, 20, 20)
     reference = draw(plant.process("standard"), FIRST).reference
     truth = [flight(rudder(0, None, -0.7), aileron(20, None, -0.5), steps=40), flight(aileron(0, None, -0.8), steps=40)]
@@ -141,7 +116,7 @@ def test_two_that_overlap_are_bayes_by_brute_force():
             then = np.log1p(-first) + np.log(late) + prior[q] + density([(q, 20)])
             found.setdefault(label, []).extend([once, then])
             for other in kinds:
-                both = int(bank.labels[events.modes[q] | events.modes[other]])
+                both = dict(zip(bank.sets, bank.labels, strict=True)).get(events.modes[q] | events.modes[other], -1)
                 if q != other and both >= 0:  # the only other kind: its share of those that may begin is 1
                     weight = np.log(first) + prior[q] + np.log(more)
                     found.setdefault(both, []).append(weight + density([(q, 0), (other, 20)]))
@@ -155,8 +130,8 @@ def test_two_that_overlap_are_bayes_by_brute_force():
 def test_no_weight_is_lost_when_events_end_and_begin():
     plant = build("HUAVHover")
     drawn = [draw(plant.process("standard"), FIRST + i) for i in range(400)]
-    events = events_of(plant, drawn, overlapping=True)
-    bank, rng = Bank(plant, fit_belief(plant, "standard"), events, 3, 120, 1), np.random.default_rng(4)
+    events = events_of(plant, drawn)
+    bank, rng = Bank(plant, fit_belief(plant, "standard"), events, 3, 1, 120), np.random.default_rng(4)
     s = bank.start(2)
     u = np.tile(plant.trim_command, (2, 1))
     for step in range(300, 400):

@@ -10,21 +10,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.filters.hypotheses import NEVER
-from baselines.filters.onset_bank import Bank, Onsets, events_of_process, most_telling
+from baselines.filters.event_bank import Bank, Hypotheses, events_of_process, most_telling
+from baselines.filters.hypothesis_kernels import NEVER
 from baselines.oracles.told_onset_ekf import label_changes
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
 from fdi_gym.estimation.belief import Belief
 from fdi_gym.estimation.decision import Reading
 from fdi_gym.estimation.interval import Interval
+from fdi_gym.estimation.mixing import mixture
 from fdi_gym.faults import FaultScenario
-from fdi_gym.plant import Array, Plant
+from fdi_gym.plant import Array, NotApplicableError, Plant
 
 
 class Told(NamedTuple):
     """State: the bank, and the truth that each episode carries."""
 
-    bank: Onsets
+    bank: Hypotheses
     changes: Array  # (n, K + 1) bool: the label does, at the interval that ends at a sample
     acts: Array  # (n, K + 1) bool: a fault does over it
 
@@ -54,36 +55,32 @@ def told_events_oracle(
     """
     events = events_of_process(plant, process, courses, sizes)
     bank = Bank(plant, belief, events, onsets=2, every=1)
+    if events.more.size:
+        raise NotApplicableError("faults of this process overlap in time")
 
     def start(n: int) -> Told:
         return Told(bank.start(n), *label_changes(plant, scenarios, n))
 
-    def begun(s: Onsets, step: Array, u: Array) -> Onsets:
+    def begun(s: Hypotheses, step: Array, u: Array) -> Hypotheses:
         """A fault begins, of whichever kind: nothing else is possible any more."""
-        s = bank.begun(s, step, u)
-        log = np.full(s.log.shape, NEVER)
-        log[:, bank.s :: bank.s] = events.log_prior
-        return s._replace(log=log)
+        return bank.begun(s, step, u, np.ones((len(step), 1)), np.zeros(0))[0]
 
-    def over(s: Onsets) -> Onsets:
+    def over(s: Hypotheses) -> Hypotheses:
         """No fault acts any more: the healthy filter is the mixture of all."""
-        s = bank.healed(s, s.log)
-        log = np.full(s.log.shape, NEVER)
-        log[:, 0] = 0.0
-        return s._replace(log=log)
+        X, P, log, own = s.X.copy(), s.P.copy(), np.full(s.log.shape, NEVER), slice(bank.m, bank.m + bank.width)
+        X[..., own], P[..., own, :], P[..., own] = 0.0, 0.0, 0.0
+        mean, covariance = mixture(np.exp(s.log)[:, None], X, P)
+        X[:, 0], P[:, 0], log[:, 0] = mean[:, 0], covariance[:, 0], 0.0
+        return s._replace(X=X, P=P, log=log)
 
     def predict(s: Told, at: Interval) -> Told:
         each, k = np.arange(len(at.k)), np.minimum(at.k, s.acts.shape[1] - 1)
-        changes, acts = s.changes[each, k], s.acts[each, k]
-        found = s.bank
-        for rows, turn in (
-            (np.flatnonzero(changes), lambda part, rows: over(part)),
-            (np.flatnonzero(changes & acts), lambda part, rows: begun(part, at.k[rows] - 1, at.u[rows])),
-        ):
-            if rows.size:
-                found = Onsets(*(a.copy() for a in found))
-                for a, new in zip(found, turn(Onsets(*(a[rows] for a in found)), rows), strict=True):
-                    a[rows] = new
+        found, ends = s.bank, np.flatnonzero(s.changes[each, k])
+        if ends.size:
+            found = found.put(ends, over(found.of(ends)))
+        begins = ends[s.acts[ends, k[ends]]]
+        if begins.size:
+            found = found.put(begins, begun(found.of(begins), at.k[begins] - 1, at.u[begins]))
         return s._replace(bank=bank.moved(found, at))
 
     def update(s: Told, at: Interval, y: Array, seen: Array) -> Told:

@@ -46,8 +46,9 @@ class Events(NamedTuple):
     more: Array  # (most - 1,) that another begins at a step at which 1, 2, ... act; empty: they follow one another
     end: Array  # (ages,) probability that it ends at an age [samples] that it has reached; empty: events stay
     share: Array  # (labels,) of the samples
-    physical: Array  # (e,) positions in p of the physical parameters that are drawn for a flight, and
-    spread: Array  # (e, c) how: standard normal numbers times this, added to the nominal ones; c = 0: none, or too many
+    physical: Array  # (e,) positions in p of the physical parameters that a flight has other than nominal; none: or too many
+    mean: Array  # (e,) their mean deviation, and
+    spread: Array  # (e, c) how they vary around it: this times standard normal numbers
 
     def at(self, age: Array) -> Array:
         """The courses at an age [s]: (..., r, slots) of ages (..., r, slots), as shares of the values."""
@@ -88,12 +89,17 @@ class _Count:
 
 class _Event(NamedTuple):
     modes: frozenset[str]
-    kind: tuple[Any, ...]
+    label: int
+    kind: tuple[Any, ...]  # events alike in it are of one kind
+    course: int
+    held: list[int]  # (p,) commands
+    lag: list[int]  # (p,)
     values: Array  # (p,) deviations
     steady: Array  # (p,) those without a course
     first: float
     second: float
-    wander: Array  # (samples,) deviations of the entry that wanders; empty: none does
+    walker: int  # position of the entry that wanders; -1: none does
+    walk: Array  # (samples,) its deviations
 
 
 def _groups(scenario: FaultScenario) -> list[tuple[int, int, list[Fault]]]:
@@ -106,15 +112,10 @@ def _groups(scenario: FaultScenario) -> list[tuple[int, int, list[Fault]]]:
     return [(onset, end, faults) for (onset, end), faults in sorted(found.items())]
 
 
-def _overlap(groups: Sequence[tuple[int, int, list[Fault]]]) -> bool:
-    """Whether an event begins while another acts."""
-    return any(later[0] < earlier[1] for earlier, later in itertools.pairwise(groups))
-
-
-def _event(plant: Plant, entries: list[int], faults: list[Fault], wandering: bool) -> _Event:
+def _event(plant: Plant, entries: list[int], faults: list[Fault]) -> _Event:
     names, nominal = plant.theta_entries, plant.nominal_theta
     values, steady, held, lag = np.zeros(len(entries)), np.zeros(len(entries)), [-1] * len(entries), [0] * len(entries)
-    course, first, second, wander = AT_ONCE, 1.0, 1.0, np.zeros(0)
+    course, first, second, walker, walk = AT_ONCE, 1.0, 1.0, -1, np.zeros(0)
     commands = [s.name for s in plant.commands]
     for effect in itertools.chain.from_iterable(fault.effects for fault in faults):
         j = entries.index(names.index(effect.entry))
@@ -126,9 +127,9 @@ def _event(plant: Plant, entries: list[int], faults: list[Fault], wandering: boo
                 course, first = ALTERNATES, period
                 values[j], steady[j] = (value - other) / 2, (value + other) / 2 - nominal[entries[j]]
                 continue
-            case Samples(values=samples) if wandering:
-                course, wander = WANDERS, np.array(samples) - nominal[entries[j]]
-                values[j] = wander.mean()
+            case Samples(values=samples):
+                course, walker, walk = WANDERS, j, np.array(samples) - nominal[entries[j]]
+                values[j] = walk.mean()
                 continue
             case Abrupt():
                 pass
@@ -147,8 +148,9 @@ def _event(plant: Plant, entries: list[int], faults: list[Fault], wandering: boo
         )
         values, steady = np.where(waves, values, 0.0), np.where(waves, steady, values)
     modes = frozenset(fault.mode for fault in faults)
-    kind = (plant.label_of(modes), tuple(sorted(fault.kind for fault in faults)), course, tuple(held), tuple(lag))
-    return _Event(modes, kind, values, steady, first, second, wander)
+    label = plant.label_of(modes)
+    kind = (label, tuple(sorted(fault.kind for fault in faults)), course, tuple(held), tuple(lag), walker)
+    return _Event(modes, label, kind, course, held, lag, values, steady, first, second, walker, walk)
 
 
 def _cells(events: list[_Event], courses: int, sizes: int) -> list[list[_Event]]:
@@ -169,18 +171,18 @@ def _quantiles(values: Array, count: int) -> list[Array]:
     return np.array_split(np.argsort(values, kind="stable"), max(count, 1))
 
 
-def _parameters(plant: Plant, scenarios: Sequence[FaultScenario]) -> tuple[Array, Array]:
-    """Which physical parameters vary from flight to flight (e,), and along which directions (e, c)."""
+def _parameters(plant: Plant, scenarios: Sequence[FaultScenario]) -> tuple[Array, Array, Array]:
+    """Which physical parameters are not nominal (e,), by how much on average, and how they vary around it (e, c)."""
     drawn = np.array([plant.physical(s.physical) if s.physical else plant.nominal_p for s in scenarios]) - plant.nominal_p
     which = np.flatnonzero(drawn.any(axis=0))
-    var, axes = np.linalg.eigh(np.atleast_2d(drawn[:, which].T @ drawn[:, which] / len(drawn)))
-    spread = (axes * np.sqrt(np.maximum(var, 0.0)))[:, var > NEGLIGIBLE * max(var.max(initial=0.0), 1e-300)]
-    return (which, spread) if spread.shape[1] <= MANY else (which[:0], np.zeros((0, 0)))
+    drawn = drawn[:, which]
+    mean = drawn.mean(axis=0)
+    var, axes = np.linalg.eigh(np.atleast_2d((drawn - mean).T @ (drawn - mean) / len(drawn)))
+    spread = (axes * np.sqrt(np.maximum(var, 0.0)))[:, var > NEGLIGIBLE * (drawn**2).sum() / len(drawn)]
+    return (which, mean, spread) if spread.shape[1] <= MANY else (which[:0], mean[:0], np.zeros((0, 0)))
 
 
-def events_of(
-    plant: Plant, scenarios: Sequence[FaultScenario], *, courses: int = 2, sizes: int = 1, overlapping: bool = False
-) -> Events:
+def events_of(plant: Plant, scenarios: Sequence[FaultScenario], *, courses: int = 2, sizes: int = 1) -> Events:
     """The events of a process, from scenarios that it drew.
 
     Args:
@@ -188,13 +190,10 @@ def events_of(
         scenarios: Thousands of them, of one length.
         courses: Cells of a kind whose course varies, by the time that it takes.
         sizes: Cells of each of those, by the values.
-        overlapping: Events may overlap, and one may wander: its values are then a first-order Gaussian sequence.
 
     Raises:
-        NotApplicableError: Events overlap, or a fault has no course that could be known.
+        NotApplicableError: The process has no faults, or one has no course that could be known.
     """
-    if not overlapping and any(_overlap(_groups(scenario)) for scenario in scenarios):
-        raise NotApplicableError("faults of this process overlap in time: it has no events one after the other")
     names = plant.theta_entries
     entries = sorted({names.index(e.entry) for s in scenarios for fault in s.faults for e in fault.effects})
     K, labels = max(s.steps for s in scenarios), len(plant.labels)
@@ -205,7 +204,7 @@ def events_of(
         groups, free, acting = _groups(scenario), 0, []  # free: since when; acting: ends of those that act
         for onset, end, faults in groups:
             acting = [other for other in acting if other > onset]
-            event = _event(plant, entries, faults, overlapping)
+            event = _event(plant, entries, faults)
             kinds.setdefault(event.kind, []).append(event)
             if acting:
                 begun = _longer(begun, len(acting))
@@ -229,9 +228,9 @@ def events_of(
     offset, held, lag = np.zeros((r, 2, p)), np.zeros((r, p), np.int64), np.zeros((r, p), np.int64)
     rates, lines = np.array([np.mean([e.first for e in cell]) for cell in cells]), []
     for i, cell in enumerate(cells):
-        held[i], lag[i] = cell[0].kind[3], cell[0].kind[4]
+        held[i], lag[i] = cell[0].held, cell[0].lag
         offset[i, 1] = np.mean([e.steady for e in cell], axis=0)
-        if cell[0].kind[2] == WANDERS:
+        if cell[0].course == WANDERS:
             offset[i, 0], line, rates[i] = _wandering(cell)
         else:
             offset[i, 0], line = _spread(cell)
@@ -244,10 +243,10 @@ def events_of(
     longest = int(np.flatnonzero(lasts.over)[-1]) + 1 if lasts.over.any() else 0
     bits = [mode.name for mode in plant.modes]
     return Events(
-        np.array(entries), np.array([cell[0].kind[0] for cell in cells]),
+        np.array(entries), np.array([cell[0].label for cell in cells]),
         np.array([sum(1 << bits.index(name) for name in cell[0].modes) for cell in cells]),
         offset[:, 0], offset[:, 1], direction[:, :p], direction[:, p:], held, lag,
-        np.array([cell[0].kind[2] for cell in cells]), rates,
+        np.array([cell[0].course for cell in cells]), rates,
         np.array([np.mean([e.second for e in cell]) for cell in cells]), np.log(size / size.sum()),
         first.rate(max(1, K // BINS)), again.rate(max(1, K // BINS)),
         (_longer(begun, len(acted)) / np.maximum(acted, 1.0))[: len(begun)],
@@ -282,10 +281,9 @@ def _spread(cell: list[_Event]) -> tuple[Array, Array]:
 
 def _wandering(cell: list[_Event]) -> tuple[Array, Array, float]:
     """Mean (p,), direction (2 p, 1) and correlation over a sample of values that wander, those of all events together."""
-    values = np.array([e.values for e in cell])
-    mean, j = values.mean(axis=0), int(np.argmax(np.ptp(values, axis=0)))
-    around = [e.wander - np.concatenate([e.wander for e in cell]).mean() for e in cell]
+    mean, middle = np.mean([e.values for e in cell], axis=0), np.concatenate([e.walk for e in cell]).mean()
+    around = [e.walk - middle for e in cell]
     power = sum(float(a @ a) for a in around)
-    size, line = sum(len(a) for a in around), np.zeros((2 * len(mean), 1))
-    line[j] = np.sqrt(power / size)
-    return mean, line, sum(float(a[1:] @ a[:-1]) for a in around) / power
+    line = np.zeros((2 * len(mean), 1))
+    line[cell[0].walker] = np.sqrt(power / sum(len(a) for a in around))
+    return mean, line, sum(float(a[1:] @ a[:-1]) for a in around) / power if power > 0.0 else 1.0

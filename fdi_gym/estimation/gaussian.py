@@ -159,18 +159,8 @@ def predict(
     """
     X1, P1 = np.empty(X.shape), np.empty(P.shape)
     known = model.unmeasured if d is None else d
-    _call(
-        kernels.predict,
-        (address(predict_lanes), _rule(rule), *model.constants, model.limit, model.linear),
-        X,
-        P,
-        t,
-        u,
-        known,
-        Q,
-        X1,
-        P1,
-    )
+    constants = (address(predict_lanes), _rule(rule), *model.constants, model.limit, model.linear)
+    _call(kernels.predict, constants, X, P, t, u, known, Q, X1, P1)
     return X1, P1
 
 

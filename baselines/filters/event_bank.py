@@ -1,0 +1,262 @@
+"""A bank of filters over what a fault process does: which events act, since when, how large.
+
+A filter is told the process (`fdi_gym.estimation.events`). A hypothesis is a set of events with their onsets, and an
+extended Kalman filter of the state, of the events' magnitudes and of the physical parameters that differ from flight to
+flight. At every few samples each kind of event may begin, beside those that act, and each that acts may end. A hypothesis in
+which one begins starts from what the other knows, with the magnitudes' prior; its weight is the probability of that
+beginning, times the likelihood of what was measured since. Of the hypotheses with the same kinds of event so many are kept,
+and of all of them so many: those two become one, mean and covariance matched, that are least likely for how close their
+onsets are, and the least likely give way. What an event leaves when it ends becomes one with the likeliest hypothesis
+without it.
+
+The bank of hypotheses is D. T. Magill's, IEEE TAC 10(4), 1965; onsets kept in limited number: A. S. Willsky, H. L. Jones,
+IEEE TAC 21(1), 1976, and the generalised pseudo-Bayes estimators of J. K. Tugnait, Automatica 18(5), 1982; sets of them:
+D. B. Reid, IEEE TAC 24(6), 1979.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from scipy.special import logsumexp
+
+from baselines.filters.event_kernels import lines, renew, wander
+from baselines.filters.hypothesis_kernels import NEVER
+from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser_of
+from fdi_gym.diagnosis.fitting import VALIDATION_SEED, floored
+from fdi_gym.estimation.augmented import AugmentedModel, augmented, on_lines
+from fdi_gym.estimation.belief import Belief, fault_inputs
+from fdi_gym.estimation.decision import Reading, Rule, by_candidate
+from fdi_gym.estimation.events import WANDERS, Events, events_of
+from fdi_gym.estimation.interval import Interval
+from fdi_gym.model import contiguous
+from fdi_gym.plant import Array, NotApplicableError, Plant
+
+FIRST, DRAWN = 700_000, 2000  # scenarios from VALIDATION_SEED + FIRST on
+GIVEN_UP = -1000.0  # log weight, as a share of all, below which a hypothesis is: at -100 some still come back
+
+
+class Hypotheses(NamedTuple):
+    """State: the healthy filter first, then hypotheses in no order; up to E events act at once."""
+
+    X: Array  # (n, count, N)
+    P: Array  # (n, count, N, N)
+    log: Array  # (n, count) log weights; NEVER where nothing is
+    kind: Array  # (n, count, E) of the events, in rising order, then -1
+    onset: Array  # (n, count, E) steps at which they began; between two, where those became one
+    held: Array  # (n, count, E, p) deviation of held entries
+    first: Array  # (n,) share of the healthy weight that no event came before
+    since: Array  # (n,) step at which the last one ended for the others, on average
+    length: Array  # (n, count, E) of the courses
+    u: Array  # (n, n_u) the command before the last
+    nu: Array  # (n, m) innovation of the healthy filter
+    S: Array  # (n, m, m) its covariance
+
+    def of(self, rows: Array) -> Hypotheses:
+        """Those of some episodes."""
+        return Hypotheses(*(a[rows] for a in self))
+
+    def put(self, rows: Array, part: Hypotheses) -> Hypotheses:
+        """With those of some episodes replaced."""
+        if len(rows) == len(self.X):
+            return part
+        found = Hypotheses(*(a.copy() for a in self))
+        for a, new in zip(found, part, strict=True):
+            a[rows] = new
+        return found
+
+
+def taken(table: Array, rows: Array) -> Array:
+    """Some rows of a table (n, count, ...), numbered through; the table itself where those are all."""
+    flat = table.reshape(-1, *table.shape[2:])
+    return flat if len(rows) == len(flat) else flat[rows]
+
+
+def put(table: Array, rows: Array, values: Array) -> Array:
+    """The table (n, count, ...) with other values in these rows."""
+    if len(rows) == table.shape[0] * table.shape[1]:
+        return values.reshape(table.shape)
+    found = table.copy()
+    found.reshape(-1, *table.shape[2:])[rows] = values
+    return found
+
+
+class Bank:
+    """The filter's functions for a plant, a belief and events.
+
+    onsets: How many hypotheses with the same kinds of event are kept. count: How many in all; None: that many of each kind,
+    where events follow one another. every: Samples from one onset to the next.
+    """
+
+    def __init__(self, plant: Plant, belief: Belief, events: Events, onsets: int, every: int, count: int | None = None):
+        self.plant, self.events, self.keep, self.every = plant, events, onsets, every
+        (r, p, self.f), (e, c) = events.direction.shape, events.spread.shape
+        self.E, self.count = 1 + len(events.more), 1 + r * onsets if count is None else count
+        self.width = self.E * self.f
+        R = plant.R[np.ix_(belief.sensors, belief.sensors)]  # errors of the model are known or estimated, not noise
+        base = augmented(plant, msgspec.structs.replace(belief, Q=floored(plant, plant.Q), R=R) if e else belief)
+        entries = np.concatenate([events.entries, len(plant.theta) + events.physical])
+        line = np.zeros((1, p + e)), np.zeros((1, p + e, self.width + c)), np.zeros((1, self.width + c))
+        model = on_lines(base, *line, 1.0, entries)
+        self.m, P0 = model.z.start, model.P0.copy()  # magnitudes, then parameters
+        own = range(self.m + self.width, model.z.stop)
+        P0[own, own] = 1.0
+        self.model = model.replace(P0=P0)
+        moves = (events.direction != 0.0).any(axis=1) | (events.steady_direction != 0.0).any(axis=1)
+        self.M0 = moves.astype(float)
+        self.deviations = tuple(
+            contiguous(a) for a in (events.offset, events.direction, events.steady, events.steady_direction)
+        )
+        self.rates = np.where(events.course == WANDERS, events.first, 1.0)
+        self.stays = np.concatenate([[0.0], np.cumsum(np.log1p(-np.minimum(events.end, 1 - 1e-12)))])
+        names, theta = [mode.name for mode in plant.modes], fault_inputs(plant).entries.tolist()
+        sets = {sum(1 << names.index(name) for name in label.modes): i for i, label in enumerate(plant.labels)}
+        sets |= dict(zip(events.modes.tolist(), events.label.tolist(), strict=True))
+        self.sets, self.labels = np.array(list(sets)), np.array(list(sets.values()))  # of modes, and what says them
+        known = [(j, events.entries.tolist().index(e)) for j, e in enumerate(theta) if e in events.entries]
+        self.p, self.known = len(theta), np.array(known, np.int64).reshape(-1, 2).T
+
+    def start(self, n: int) -> Hypotheses:
+        """Healthy, and nothing has begun."""
+        model, shape, m = self.model, (n, self.count, self.E), len(self.model.R)
+        log = np.full((n, self.count), NEVER)
+        log[:, 0] = 0.0
+        return Hypotheses(
+            np.tile(model.X0, (n, self.count, 1)), np.tile(model.P0, (n, self.count, 1, 1)), log,
+            np.full(shape, -1, np.int64), np.zeros(shape), np.zeros((*shape, len(self.events.entries))), np.ones(n),
+            np.zeros(n), np.ones(shape), np.tile(self.plant.trim_command, (n, 1)), np.zeros((n, m)),
+            np.tile(model.R, (n, 1, 1)),
+        )  # fmt: skip
+
+    def live(self, s: Hypotheses) -> Array:
+        """Which filters run (rows,), numbered through: the healthy ones, and all with a weight."""
+        runs = s.log > NEVER
+        runs[:, 0] = True
+        return np.flatnonzero(runs)
+
+    def on(self, s: Hypotheses, rows: Array) -> AugmentedModel:
+        """The model on the lines of these filters."""
+        (_, p, _), (e, c) = self.events.direction.shape, self.events.spread.shape
+        offset, direction = np.zeros((len(rows), p + e)), np.zeros((len(rows), p + e, self.width + c))
+        offset[:, p:], direction[:, p:, self.width :] = self.events.mean, self.events.spread
+        lines(rows, s.kind, s.length, s.held, *self.deviations, offset, direction)
+        return self.model.on(offset, direction)
+
+    def chances(self, s: Hypotheses, step: Array) -> Array:
+        """That another event begins within the period from a step (n,) on, by how many act (n, E)."""
+        e, ahead = self.events, np.arange(self.every)
+        last = len(e.onset) - 1
+        gap = np.maximum(step - s.since, 0.0).astype(np.int64)
+        none = s.first * e.onset[np.minimum(step[:, None] + ahead, last)].sum(axis=1)
+        none += (1.0 - s.first) * e.again[np.minimum(gap[:, None] + ahead, last)].sum(axis=1)
+        more = np.broadcast_to(self.every * e.more, (len(step), self.E - 1))
+        return np.clip(np.concatenate([none[:, None], more], axis=1), 1e-12, 0.5)
+
+    def renewed(self, s: Hypotheses, step: Array, u: Array) -> Hypotheses:
+        """Events end and begin, at the steps (n,)."""
+        s, before = self.begun(s, step, u, self.chances(s, step), self.stays if self.events.end.size else np.zeros(0))
+        stayed = np.exp(np.minimum(before, 0.0))
+        first = s.first * stayed
+        since = (1.0 - s.first) * stayed * s.since + (1.0 - stayed) * (step - self.every / 2)
+        return s._replace(first=first, since=since / np.maximum(1.0 - first, 1e-12))
+
+    def begun(self, s: Hypotheses, step: Array, u: Array, chance: Array, stays: Array) -> tuple[Hypotheses, Array]:
+        """Events end, where `stays` is not empty, and begin, with chances (n, E) by how many act.
+
+        With it (n,) the log of what the healthy weight was before events ended, as a share of what it was then.
+        """
+        e = self.events
+        commands = np.where(e.lag[None] > 0, s.u[:, np.maximum(e.held, 0)], u[:, np.maximum(e.held, 0)])
+        fresh, healed = contiguous(np.where(e.held >= 0, commands, 0.0)), np.empty(len(step))
+        X, P, log, kind, onset, held = (a.copy() for a in s[:6])
+        renew(
+            X, P, log, kind, onset, held, step.astype(float), contiguous(chance), stays, self.every, self.m, self.f,
+            self.keep, e.modes, self.sets, e.log_prior, self.M0, fresh, healed,
+        )  # fmt: skip
+        return s._replace(X=X, P=P, log=log, kind=kind, onset=onset, held=held), s.log[:, 0] - healed
+
+    def predict(self, s: Hypotheses, at: Interval) -> Hypotheses:
+        """Over the interval: what may end or begin at its start does."""
+        step = at.k - 1
+        turn = np.flatnonzero(step % self.every == 0)
+        if turn.size:
+            s = s.put(turn, self.renewed(s.of(turn), step[turn], at.u[turn]))
+        return self.moved(s, at)
+
+    def moved(self, s: Hypotheses, at: Interval) -> Hypotheses:
+        """All filters, over the interval."""
+        age = np.maximum(at.k[:, None, None] - s.onset, 0.0) * self.plant.dt
+        s = s._replace(u=at.u, length=contiguous(self.events.of(np.maximum(s.kind, 0), age)))
+        rows = self.live(s)
+        X, P = self.on(s, rows).predict("extended", taken(s.X, rows), taken(s.P, rows), at.of(rows // self.count))
+        if (self.rates < 1.0).any():
+            wander(rows, s.kind, self.rates, self.m, self.f, X, P)
+        return s._replace(X=put(s.X, rows, X), P=put(s.P, rows, P))
+
+    def update(self, s: Hypotheses, at: Interval, y: Array, seen: Array) -> Hypotheses:
+        """Weigh and correct those that run; of those that have become negligible the place is free."""
+        rows = self.live(s)
+        of, healthy = rows // self.count, rows % self.count == 0
+        done = self.on(s, rows).update("extended", taken(s.X, rows), taken(s.P, rows), at.of(of), y[of], seen[of])
+        log = put(s.log, rows, np.maximum(taken(s.log, rows) + done.log_likelihood, NEVER))
+        log = np.where(s.log <= NEVER, NEVER, log - logsumexp(log, axis=1, keepdims=True))
+        log[:, 1:] = np.where(log[:, 1:] < GIVEN_UP, NEVER, log[:, 1:])
+        X, P = put(s.X, rows, done.X), put(s.P, rows, done.P)
+        return s._replace(X=X, P=P, log=log, nu=done.nu[healthy], S=done.S[healthy])
+
+    def read(self, s: Hypotheses) -> Reading:
+        """Probabilities of the labels, and the mean of the fault vector."""
+        w, (j, at) = np.exp(s.log), self.known
+        acts, kind = s.kind >= 0, np.maximum(s.kind, 0)
+        modes = np.bitwise_or.reduce(np.where(acts, self.events.modes[kind], 0), axis=2)
+        label = self.labels[(modes[..., None] == self.sets).argmax(axis=2)]
+        probs = np.zeros((len(w), len(self.plant.labels)))
+        np.add.at(probs, (np.arange(len(w))[:, None], label), w)
+        probs /= probs.sum(axis=1, keepdims=True)
+        m = s.X[..., self.m : self.m + self.width].reshape(*kind.shape, self.f, 1)
+        offset, direction, steady, steady_direction = (a[:, at][kind] for a in self.deviations)
+        along, beside = offset + (direction @ m)[..., 0], steady + (steady_direction @ m)[..., 0]
+        theta = (s.length[..., None] * along + beside + s.held[..., at]) * acts[..., None]
+        z = np.zeros((len(w), self.p))
+        z[:, j] = (w[..., None] * theta.sum(axis=2)).sum(axis=1)
+        x = (w[..., None] * s.X[..., self.model.x]).sum(axis=1)
+        return Reading(z, x=x, nu=s.nu, S=s.S, probs=probs)
+
+    def expect(self, s: Hypotheses, at: Interval) -> Array:
+        """What the healthy filter expects the sensors to read."""
+        return self.model.expect(s.X[:, 0, self.model.x], at)
+
+
+def events_of_process(plant: Plant, process: str, courses: int, sizes: int) -> Events:
+    """The events of a fault process, counted in scenarios with validation seeds.
+
+    Raises:
+        ValueError: Cells are one or more.
+        NotApplicableError: Sensors may fail too, or a fault has no course that could be known.
+    """
+    at_least(1, courses=courses, sizes=sizes)
+    if plant.bare is not None:
+        raise NotApplicableError("sensors that fail by noise, freezing or spikes are no lines in theta")
+    drawn = [plant.draw(process, VALIDATION_SEED + FIRST + i) for i in range(DRAWN)]
+    return events_of(plant, drawn, courses=courses, sizes=sizes)
+
+
+def at_least(least: int, **numbers: int) -> None:
+    """Refuses numbers below one that is allowed."""
+    for name, value in numbers.items():
+        if value < least:
+            raise ValueError(f"{name} is {least} or more, not {value}")
+
+
+def most_telling(events: Events) -> Rule:
+    """The most probable label in proportion to its share of all samples, at once."""
+    balanced = np.where(events.share > 0, 1.0 / np.maximum(events.share, 1e-12), 0.0)
+    return by_candidate(lambda reading, label: np.argmax(np.asarray(reading.probs) * balanced, axis=1), 1)
+
+
+def diagnosing(bank: Bank) -> Diagnoser:
+    """The bank's filter with that decision."""
+    filter = Filter(bank.start, bank.predict, bank.update, bank.read, expect=bank.expect, innovation=lambda s: (s.nu, s.S))
+    return diagnoser_of(bank.plant, filter, most_telling(bank.events))
