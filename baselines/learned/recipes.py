@@ -125,10 +125,10 @@ SEQUENCES = {
 }  # fmt: skip
 FILTERS = {  # that residual_net is shown, and training flights per condition: filters cost more than networks
     "B747Lateral": (("onset_bank", "switching_bayes_bank"), 600),
-    "HUAVHover": (("hypothesis_bank", "ascdkf"), 1000),
-    "MissilePitch": (("augmented_ekf_imm", "augmented_ekf_mode_probabilities"), 400),
+    "HUAVHover": (("overlap_bank", "hypothesis_bank"), 240),
+    "MissilePitch": (("onset_bank_fine", "augmented_ekf_imm"), 240),
     "CMGSatellite": (("mekf",), 400),
-    "ThreeTank": (("augmented_ekf", "multiple_model_ekf"), 600),
+    "ThreeTank": (("onset_bank", "multiple_model_ekf"), 400),
 }
 # fault windows in a flight that networks are shown, and their pace: whole flights are long, and its suites are so too
 WINDOWS = {"CMGSatellite": {"standard": (3, 0.2), "mixed": (3, 0.1)}}
