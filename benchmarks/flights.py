@@ -4,7 +4,7 @@
 
 The largest budget is the recipe's or that given, the others a half, a quarter and an eighth of it. Each run gives the
 weights of `fdi-gym train residual_net PLANT --budget N` and goes on where it was killed; flights are flown and shown to the
-filters once for all. All are scored on the validation flights of each condition, and so is `onset_bank`, the best that is
+filters once for all. All are scored on the validation flights of each condition, and so is the bank that is the best
 known to be attained, under those named. Writes leaderboards/learning/flights.json, and from it flights.md and flights.png;
 what these say of other plants stays.
 """
@@ -33,7 +33,8 @@ from fdi_gym.metrics import outcome
 from fdi_gym.plots import panels
 from fdi_gym.tables import markdown
 
-METHOD, REFERENCE = "residual_net", "onset_bank"
+METHOD = "residual_net"
+REFERENCES = {"HUAVHover": "overlap_bank", "MissilePitch": "onset_bank_fine"}  # onset_bank elsewhere
 HALVINGS = 3
 TREND = 3  # of the largest budgets the trend is taken
 POINTS = {"standard": 1.0, "hard": 3.0}  # that are left of a gap that counts as closed
@@ -42,8 +43,8 @@ HOME = Path(__file__).parent.parent / "leaderboards" / "learning"
 INTRODUCTION = """# How many flights more
 
 Written by `python benchmarks/flights.py PLANT`. `residual_net` with ever more training flights, passes over each and all
-else the same, one seed. Balanced accuracy per sample in percent, on the same validation flights for all, and that of
-`onset_bank`, which is told the plant's equations and the process: on most suites [the best that is known to be
+else the same, one seed. Balanced accuracy per sample in percent, on the same validation flights for all, and that of a bank
+that is told the plant's equations and the process: on most suites [the best that is known to be
 attained](../attainable.md). Gaps to it are paired, with 95 % intervals over flights; [another seed of training](seeds.md)
 moves a score, too.
 
@@ -94,11 +95,11 @@ def declared(training, index):
     return Decisions(held > 0, held, None, None, None)
 
 
-def judged(plant, process, obs):
-    """What the reference says of flights; halves of them side by side."""
+def judged(name, plant, process, obs):
+    """What a reference says of flights; halves of them side by side."""
 
     def labels(some):
-        return run(make_diagnoser(REFERENCE, plant, process=process), some).label
+        return run(make_diagnoser(name, plant, process=process), some).label
 
     label = np.concatenate(joblib.Parallel(2)(joblib.delayed(labels)(some) for some in np.array_split(obs, 2)))
     return Decisions(label > 0, label, None, None, None)
@@ -117,7 +118,7 @@ def trend(budgets, scores, reference, points):
     return slope, budgets[-1] * 2.0 ** np.where(closed, 0.0, np.clip(doublings, 0.0, FAR + 1.0))
 
 
-def curve_of(budgets, drawn, points):
+def curve_of(budgets, drawn, reference, points):
     """The scores of the budgets and what a doubling gives; with a reference the gap, and the flights that close it."""
 
     def interval(values):
@@ -125,15 +126,15 @@ def curve_of(budgets, drawn, points):
 
     scores, again = 100 * drawn.score, 100 * drawn.again
     n = len(budgets)
-    reference, others = (scores[-1], again[:, -1]) if points is not None else (np.inf, np.inf)
-    slope, needed = trend(budgets, scores[:n], reference, points or 0.0)
+    attained, others = (scores[-1], again[:, -1]) if points is not None else (np.inf, np.inf)
+    slope, needed = trend(budgets, scores[:n], attained, points or 0.0)
     slopes, all_needed = trend(budgets, again[:, :n], others, points or 0.0)
     found = {"scores": scores[:n].round(2).tolist(), "doubling": [round(float(slope), 2), *interval(slopes)]}
     if points is None:
         return found
-    gaps = [(100 * np.array(drawn.difference(REFERENCE, str(budget)))).round(2).tolist() for budget in budgets]
+    gaps = [(100 * np.array(drawn.difference(reference, str(budget)))).round(2).tolist() for budget in budgets]
     return found | {
-        "attained": round(float(reference), 2), "points": points, "gaps": gaps,
+        "attained": round(float(attained), 2), "points": points, "gaps": gaps,
         "needed": [round(float(needed)), *interval(all_needed)],
     }  # fmt: skip
 
@@ -141,7 +142,7 @@ def curve_of(budgets, drawn, points):
 def measured(plant_id, budget, gaps, work):
     """The curves of a plant, one per condition; those of the gaps with the reference."""
     plant, flown = load_plant(plant_id), {}
-    recipe = residual_recipe(plant, budget)
+    recipe, reference = residual_recipe(plant, budget), REFERENCES.get(plant_id, "onset_bank")
     budgets = [recipe.flights >> i for i in reversed(range(HALVINGS + 1))]
     runs = [trained(plant, n, work, flown) for n in reversed(budgets)][::-1]
     found = {}
@@ -151,14 +152,17 @@ def measured(plant_id, budget, gaps, work):
         every = {str(n): declared(one, i) for n, one in zip(budgets, runs, strict=True)}
         points = POINTS[condition.name] if condition.name in gaps else None
         if points is not None:
-            every[REFERENCE] = judged(own, condition.process, record.obs)
+            every[reference] = judged(reference, own, condition.process, record.obs)
         scoring = own.process(condition.process).scoring
         outcomes = {
             name: [outcome(own, scoring, record, said, j) for j in range(len(record.obs))] for name, said in every.items()
         }
-        found[condition.name] = curve_of(budgets, draw_again(outcomes, len(own.labels)), points)
+        found[condition.name] = curve_of(budgets, draw_again(outcomes, len(own.labels)), reference, points)
         print(plant_id, condition.name, found[condition.name], flush=True)
-    return {"budgets": budgets, "filters": list(recipe.filters), "validation": recipe.validation, "curves": found}
+    return {
+        "budgets": budgets, "filters": list(recipe.filters), "reference": reference, "validation": recipe.validation,
+        "curves": found,
+    }  # fmt: skip
 
 
 def forecast(curve, most):
@@ -177,6 +181,7 @@ def forecast(curve, most):
 def section(found):
     """The table of a plant."""
     budgets, rows = found["budgets"], []
+    flights = [f"{n} flights" for n in budgets]
     for name, curve in found["curves"].items():
         slope, least, most = curve["doubling"]
         line = [name, *(f"{score:.1f}" for score in curve["scores"]), f"{slope:+.1f} [{least:+.1f}, {most:+.1f}]"]
@@ -184,7 +189,7 @@ def section(found):
             gap, low, high = curve["gaps"][-1]
             line += [f"{curve['attained']:.1f}", f"{gap:.1f} [{low:.1f}, {high:.1f}]", forecast(curve, budgets[-1])]
         rows.append(line + ["-"] * (len(budgets) + 5 - len(line)))
-    head = ["condition", *(f"{n} flights" for n in budgets), "a doubling", REFERENCE, "gap", "flights that close it"]
+    head = ["condition", *flights, "a doubling", found["reference"], "gap", "flights that close it"]
     shown = " and ".join(f"`{name}`" for name in found["filters"])
     return f"## {{}}\n\nShown {shown}; {found['validation']} validation flights per condition.\n\n" + markdown(head, rows)
 
