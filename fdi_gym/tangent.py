@@ -92,8 +92,8 @@ def _around(sizes: tuple[int, ...], dynamics: Any, jacobian: Any, *manifold: Any
                 for c in range(0, W, count):
                     store(V, a, c, load(V, a, c) + load(total, a, c) * (h / 6.0) if substeps else load(total, a, c))
         if curved:
-            for j in range(W):  # the projection, by differences along each column
-                small = FINE * (step[j] if j < step.size else 1.0)
+            for j in range(step.size):  # the projection, by differences along each column
+                small = FINE * step[j]
                 for a in range(n):
                     z[a], k[a] = now[a] + small * V[a, j], now[a] - small * V[a, j]
                 project(z, theta)

@@ -206,9 +206,10 @@ def test_events_that_end_give_their_weight_to_health_and_what_was_never_faulty_k
     kind, onset = np.zeros_like(s.kind), rng.integers(0, 6, s.onset.shape) * 10.0
     kind[:, 0] = -1
     s = s._replace(log=log, kind=kind, onset=onset, first=rng.uniform(0.2, 0.8, 5))
-    after = bank.renewed(s, step, np.tile(bank.plant.trim_command, (5, 1)))
+    all_of = np.arange(5)
+    after = bank.renewed(s, all_of, step, np.tile(bank.plant.trim_command, (5, 1)))
     assert_allclose(np.exp(after.log).sum(axis=1), 1.0)
-    healthy = np.exp(after.log[:, 0]) / (1.0 - bank.chances(s._replace(first=after.first, since=after.since), step)[:, 0])
+    healthy = np.exp(after.log[:, 0]) / (1.0 - bank.chances(s._replace(first=after.first, since=after.since), all_of, step)[:, 0])
     assert (healthy > np.exp(log[:, 0])).all()
     assert_allclose(after.first * healthy, s.first * np.exp(log[:, 0]), rtol=1e-6)
 
@@ -225,7 +226,7 @@ def test_a_mixture_of_two_onsets_has_the_mean_and_covariance_of_its_parts(b747_e
     kind[:, 0] = -1
     s = s._replace(X=X, P=P, log=log, kind=kind, onset=onset)
     step = np.array([200])
-    after, _ = bank.begun(s, step, np.tile(bank.plant.trim_command, (1, 1)), np.array([[0.1]]), np.zeros(0))
+    after, _ = bank.begun(s, np.arange(1), step, np.tile(bank.plant.trim_command, (1, 1)), np.array([[0.1]]), np.zeros(0))
     w = np.exp(log[0])
     mine = np.flatnonzero(~np.isin(np.exp(after.log[0]).round(12), w.round(12)))
     both = [i for i in mine if i > 0 and after.onset[0, i, 0] < 200]

@@ -135,7 +135,7 @@ def test_no_weight_is_lost_when_events_end_and_begin():
     s = bank.start(2)
     u = np.tile(plant.trim_command, (2, 1))
     for step in range(300, 400):
-        s = bank.renewed(s, np.full(2, step), u)
+        s = bank.renewed(s, np.arange(2), np.full(2, step), u)
         assert_allclose(np.exp(s.log).sum(axis=1), 1.0, atol=1e-3)  # the least likely give way
         alive = s.log > -1e300
         assert ((s.kind[:, 1:] >= 0).any(axis=2) | ~alive[:, 1:]).all()

@@ -20,17 +20,19 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from scipy.special import logsumexp
 
-from baselines.filters.event_kernels import lines, renew, wander
+from baselines.filters.bank_kernels import move, tell, weigh
+from baselines.filters.event_kernels import renew
 from baselines.filters.hypothesis_kernels import NEVER
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser_of
 from fdi_gym.diagnosis.fitting import VALIDATION_SEED, floored
-from fdi_gym.estimation.augmented import AugmentedModel, augmented, on_lines
+from fdi_gym.estimation.augmented import augmented, on_lines
 from fdi_gym.estimation.belief import Belief, fault_inputs
 from fdi_gym.estimation.decision import Reading, Rule, by_candidate
 from fdi_gym.estimation.events import WANDERS, Events, events_of
+from fdi_gym.estimation.gaussian_step import predict_lanes, update_lanes
 from fdi_gym.estimation.interval import Interval
+from fdi_gym.kernels import address
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, NotApplicableError, Plant
 
@@ -53,34 +55,6 @@ class Hypotheses(NamedTuple):
     u: Array  # (n, n_u) the command before the last
     nu: Array  # (n, m) innovation of the healthy filter
     S: Array  # (n, m, m) its covariance
-
-    def of(self, rows: Array) -> Hypotheses:
-        """Those of some episodes."""
-        return Hypotheses(*(a[rows] for a in self))
-
-    def put(self, rows: Array, part: Hypotheses) -> Hypotheses:
-        """With those of some episodes replaced."""
-        if len(rows) == len(self.X):
-            return part
-        found = Hypotheses(*(a.copy() for a in self))
-        for a, new in zip(found, part, strict=True):
-            a[rows] = new
-        return found
-
-
-def taken(table: Array, rows: Array) -> Array:
-    """Some rows of a table (n, count, ...), numbered through; the table itself where those are all."""
-    flat = table.reshape(-1, *table.shape[2:])
-    return flat if len(rows) == len(flat) else flat[rows]
-
-
-def put(table: Array, rows: Array, values: Array) -> Array:
-    """The table (n, count, ...) with other values in these rows."""
-    if len(rows) == table.shape[0] * table.shape[1]:
-        return values.reshape(table.shape)
-    found = table.copy()
-    found.reshape(-1, *table.shape[2:])[rows] = values
-    return found
 
 
 class Bank:
@@ -106,17 +80,18 @@ class Bank:
         self.model = model.replace(P0=P0)
         moves = (events.direction != 0.0).any(axis=1) | (events.steady_direction != 0.0).any(axis=1)
         self.M0 = moves.astype(float)
-        self.deviations = tuple(
-            contiguous(a) for a in (events.offset, events.direction, events.steady, events.steady_direction)
-        )
+        self.does = tuple(contiguous(a) for a in (
+            events.offset, events.direction, events.steady, events.steady_direction, events.mean, events.spread
+        ))  # fmt: skip
         self.rates = np.where(events.course == WANDERS, events.first, 1.0)
-        self.stays = np.concatenate([[0.0], np.cumsum(np.log1p(-np.minimum(events.end, 1 - 1e-12)))])
+        ends = np.log1p(-np.minimum(events.end, 1 - 1e-12))
+        self.stays = np.concatenate([[0.0], np.cumsum(ends)]) if ends.size else ends
         names, theta = [mode.name for mode in plant.modes], fault_inputs(plant).entries.tolist()
         sets = {sum(1 << names.index(name) for name in label.modes): i for i, label in enumerate(plant.labels)}
         sets |= dict(zip(events.modes.tolist(), events.label.tolist(), strict=True))
         self.sets, self.labels = np.array(list(sets)), np.array(list(sets.values()))  # of modes, and what says them
         known = [(j, events.entries.tolist().index(e)) for j, e in enumerate(theta) if e in events.entries]
-        self.p, self.known = len(theta), np.array(known, np.int64).reshape(-1, 2).T
+        self.p, self.known = len(theta), np.ascontiguousarray(np.array(known, np.int64).reshape(-1, 2).T)
 
     def start(self, n: int) -> Hypotheses:
         """Healthy, and nothing has begun."""
@@ -130,98 +105,79 @@ class Bank:
             np.tile(model.R, (n, 1, 1)),
         )  # fmt: skip
 
-    def live(self, s: Hypotheses) -> Array:
-        """Which filters run (rows,), numbered through: the healthy ones, and all with a weight."""
-        runs = s.log > NEVER
-        runs[:, 0] = True
-        return np.flatnonzero(runs)
-
-    def on(self, s: Hypotheses, rows: Array) -> AugmentedModel:
-        """The model on the lines of these filters."""
-        (_, p, _), (e, c) = self.events.direction.shape, self.events.spread.shape
-        offset, direction = np.zeros((len(rows), p + e)), np.zeros((len(rows), p + e, self.width + c))
-        offset[:, p:], direction[:, p:, self.width :] = self.events.mean, self.events.spread
-        lines(rows, s.kind, s.length, s.held, *self.deviations, offset, direction)
-        return self.model.on(offset, direction)
-
-    def chances(self, s: Hypotheses, step: Array) -> Array:
-        """That another event begins within the period from a step (n,) on, by how many act (n, E)."""
-        e, ahead = self.events, np.arange(self.every)
+    def chances(self, s: Hypotheses, turn: Array, step: Array) -> Array:
+        """That another event begins within the period from a step on, by how many act (turns, E), in these episodes."""
+        e, ahead, first = self.events, np.arange(self.every), s.first[turn]
         last = len(e.onset) - 1
-        gap = np.maximum(step - s.since, 0.0).astype(np.int64)
-        none = s.first * e.onset[np.minimum(step[:, None] + ahead, last)].sum(axis=1)
-        none += (1.0 - s.first) * e.again[np.minimum(gap[:, None] + ahead, last)].sum(axis=1)
+        gap = np.maximum(step - s.since[turn], 0.0).astype(np.int64)
+        none = first * e.onset[np.minimum(step[:, None] + ahead, last)].sum(axis=1)
+        none += (1.0 - first) * e.again[np.minimum(gap[:, None] + ahead, last)].sum(axis=1)
         more = np.broadcast_to(self.every * e.more, (len(step), self.E - 1))
         return np.clip(np.concatenate([none[:, None], more], axis=1), 1e-12, 0.5)
 
-    def renewed(self, s: Hypotheses, step: Array, u: Array) -> Hypotheses:
-        """Events end and begin, at the steps (n,)."""
-        s, before = self.begun(s, step, u, self.chances(s, step), self.stays if self.events.end.size else np.zeros(0))
-        stayed = np.exp(np.minimum(before, 0.0))
-        first = s.first * stayed
-        since = (1.0 - s.first) * stayed * s.since + (1.0 - stayed) * (step - self.every / 2)
-        return s._replace(first=first, since=since / np.maximum(1.0 - first, 1e-12))
+    def renewed(self, s: Hypotheses, turn: Array, step: Array, u: Array) -> Hypotheses:
+        """Events end and begin in some episodes (turns,), at their steps and with their commands."""
+        found, before = self.begun(s, turn, step, u, self.chances(s, turn, step), self.stays)
+        stayed, first, since = np.exp(np.minimum(before, 0.0)), s.first.copy(), s.since.copy()
+        since[turn] = (1.0 - first[turn]) * stayed * since[turn] + (1.0 - stayed) * (step - self.every / 2)
+        first[turn] *= stayed
+        since[turn] /= np.maximum(1.0 - first[turn], 1e-12)
+        return found._replace(first=first, since=since)
 
-    def begun(self, s: Hypotheses, step: Array, u: Array, chance: Array, stays: Array) -> tuple[Hypotheses, Array]:
-        """Events end, where `stays` is not empty, and begin, with chances (n, E) by how many act.
+    def begun(
+        self, s: Hypotheses, turn: Array, step: Array, u: Array, chance: Array, stays: Array
+    ) -> tuple[Hypotheses, Array]:
+        """Events end, where `stays` is not empty, and begin, with chances (turns, E) by how many act.
 
-        With it (n,) the log of what the healthy weight was before events ended, as a share of what it was then.
+        With it (turns,) the log of what the healthy weight was before events ended, as a share of what it was then.
         """
         e = self.events
-        commands = np.where(e.lag[None] > 0, s.u[:, np.maximum(e.held, 0)], u[:, np.maximum(e.held, 0)])
-        fresh, healed = contiguous(np.where(e.held >= 0, commands, 0.0)), np.empty(len(step))
+        commands = np.where(e.lag[None] > 0, s.u[turn][:, np.maximum(e.held, 0)], u[:, np.maximum(e.held, 0)])
+        fresh, healed = contiguous(np.where(e.held >= 0, commands, 0.0)), np.empty(len(turn))
         X, P, log, kind, onset, held = (a.copy() for a in s[:6])
         renew(
-            X, P, log, kind, onset, held, step.astype(float), contiguous(chance), stays, self.every, self.m, self.f,
+            turn, X, P, log, kind, onset, held, step.astype(float), contiguous(chance), stays, self.every, self.m, self.f,
             self.keep, e.modes, self.sets, e.log_prior, self.M0, fresh, healed,
         )  # fmt: skip
-        return s._replace(X=X, P=P, log=log, kind=kind, onset=onset, held=held), s.log[:, 0] - healed
+        return s._replace(X=X, P=P, log=log, kind=kind, onset=onset, held=held), s.log[turn, 0] - healed
 
     def predict(self, s: Hypotheses, at: Interval) -> Hypotheses:
         """Over the interval: what may end or begin at its start does."""
         step = at.k - 1
         turn = np.flatnonzero(step % self.every == 0)
         if turn.size:
-            s = s.put(turn, self.renewed(s.of(turn), step[turn], at.u[turn]))
-        return self.moved(s, at)
+            s = self.renewed(s, turn, step[turn], at.u[turn])
+        return self.moved(s, at, s.X, s.P) if turn.size else self.moved(s, at, np.empty(s.X.shape), np.empty(s.P.shape))
 
-    def moved(self, s: Hypotheses, at: Interval) -> Hypotheses:
-        """All filters, over the interval."""
-        age = np.maximum(at.k[:, None, None] - s.onset, 0.0) * self.plant.dt
-        s = s._replace(u=at.u, length=contiguous(self.events.of(np.maximum(s.kind, 0), age)))
-        rows = self.live(s)
-        X, P = self.on(s, rows).predict("extended", taken(s.X, rows), taken(s.P, rows), at.of(rows // self.count))
-        if (self.rates < 1.0).any():
-            wander(rows, s.kind, self.rates, self.m, self.f, X, P)
-        return s._replace(X=put(s.X, rows, X), P=put(s.P, rows, P))
+    def moved(self, s: Hypotheses, at: Interval, X: Array, P: Array) -> Hypotheses:
+        """All filters, over the interval: into X and P, which may be those of the state if nobody else has it."""
+        bound, age = self.model.compiled, np.maximum(at.k[:, None, None] - s.onset, 0.0) * self.plant.dt
+        length = contiguous(self.events.of(np.maximum(s.kind, 0), age))
+        integers, reals, step, *_ = bound.constants
+        move(
+            address(predict_lanes), integers, reals, step, bound.limit, bound.linear, self.does, self.rates, self.m,
+            at.noise(self.model.noises[0]), (at.k - 1) * self.plant.dt, contiguous(at.u),
+            bound.unmeasured if at.d is None else contiguous(at.d), s.X, s.P, s.log, s.kind, length, s.held, X, P,
+        )  # fmt: skip
+        return s._replace(X=X, P=P, u=at.u, length=length)
 
     def update(self, s: Hypotheses, at: Interval, y: Array, seen: Array) -> Hypotheses:
         """Weigh and correct those that run; of those that have become negligible the place is free."""
-        rows = self.live(s)
-        of, healthy = rows // self.count, rows % self.count == 0
-        done = self.on(s, rows).update("extended", taken(s.X, rows), taken(s.P, rows), at.of(of), y[of], seen[of])
-        log = put(s.log, rows, np.maximum(taken(s.log, rows) + done.log_likelihood, NEVER))
-        log = np.where(s.log <= NEVER, NEVER, log - logsumexp(log, axis=1, keepdims=True))
-        log[:, 1:] = np.where(log[:, 1:] < GIVEN_UP, NEVER, log[:, 1:])
-        X, P = put(s.X, rows, done.X), put(s.P, rows, done.P)
-        return s._replace(X=X, P=P, log=log, nu=done.nu[healthy], S=done.S[healthy])
+        bound, heard = self.model.compiled, self.model.sensors
+        X, P, log, nu, S = np.empty(s.X.shape), np.empty(s.P.shape), s.log.copy(), np.empty(s.nu.shape), np.empty(s.S.shape)
+        integers, reals, step, *_ = bound.constants
+        weigh(
+            address(update_lanes), integers, reals, step, bound.H, bound.plain, self.does, GIVEN_UP, self.model.noises[1],
+            at.k * self.plant.dt, contiguous(at.u), bound.unmeasured if at.d is None else contiguous(at.d),
+            y.take(heard, axis=1), seen.take(heard, axis=1), s.X, s.P, s.kind, s.length, s.held, X, P, log, nu, S,
+        )  # fmt: skip
+        return s._replace(X=X, P=P, log=log, nu=nu, S=S)
 
     def read(self, s: Hypotheses) -> Reading:
         """Probabilities of the labels, and the mean of the fault vector."""
-        w, (j, at) = np.exp(s.log), self.known
-        acts, kind = s.kind >= 0, np.maximum(s.kind, 0)
-        modes = np.bitwise_or.reduce(np.where(acts, self.events.modes[kind], 0), axis=2)
-        label = self.labels[(modes[..., None] == self.sets).argmax(axis=2)]
-        probs = np.zeros((len(w), len(self.plant.labels)))
-        np.add.at(probs, (np.arange(len(w))[:, None], label), w)
-        probs /= probs.sum(axis=1, keepdims=True)
-        m = s.X[..., self.m : self.m + self.width].reshape(*kind.shape, self.f, 1)
-        offset, direction, steady, steady_direction = (a[:, at][kind] for a in self.deviations)
-        along, beside = offset + (direction @ m)[..., 0], steady + (steady_direction @ m)[..., 0]
-        theta = (s.length[..., None] * along + beside + s.held[..., at]) * acts[..., None]
-        z = np.zeros((len(w), self.p))
-        z[:, j] = (w[..., None] * theta.sum(axis=2)).sum(axis=1)
-        x = (w[..., None] * s.X[..., self.model.x]).sum(axis=1)
+        n, (j, at) = len(s.log), self.known
+        probs, z, x = np.zeros((n, len(self.plant.labels))), np.zeros((n, self.p)), np.zeros((n, len(self.plant.states)))
+        tell(s.log, s.kind, s.length, s.held, s.X, self.m, self.does, self.events.modes, self.sets, self.labels, j, at, probs, z, x)
         return Reading(z, x=x, nu=s.nu, S=s.S, probs=probs)
 
     def expect(self, s: Hypotheses, at: Interval) -> Array:

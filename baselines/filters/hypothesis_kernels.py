@@ -2,7 +2,8 @@
 
 A hypothesis is a row: kind (E,) of the events that act, in rising order and then -1, onset (E,), held (E, p), and a filter
 X (N,), P (N, N) with its log weight, NEVER where nothing is. Row 0 flies healthy. Magnitudes of event j are the f entries of
-X from m + j f on. Hypotheses of the same kinds are of one node. A room (mean, cov, key, onset1, held1) has place for one.
+X from m + j f on. Hypotheses of the same kinds are of one node, whose number is in code. What becomes of a row is first in a
+room (key, onset1, held1, origin): its kinds and their onsets, and where its filter's entries come from.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from fdi_gym.kernels import helper
 
 NEVER = -1e300  # log weight of a place where nothing is
 WITHOUT = 1e-17  # share that changes nothing
+LESS, AS_IT_IS, MORE = -1, 0, 1  # a row without the event in a slot, itself, or with that slot free for another
 
 
 @helper
@@ -44,15 +46,6 @@ def latest(onset, kind, i):
 
 
 @helper
-def same(kind, i, key):
-    """Whether a row is of the node with these kinds."""
-    differ = 0
-    for j in range(key.size):
-        differ += kind[i, j] != key[j]
-    return differ == 0
-
-
-@helper
 def allowed(sets, modes):
     """Whether a label says these modes."""
     count = 0
@@ -62,96 +55,94 @@ def allowed(sets, modes):
 
 
 @helper
-def place_in(x, m, f, width, slot, by):
-    """Where entry x of X is once an event is taken out of a slot (by -1) or put into one (by 1); -1: nowhere.
-
-    width: f times the number of slots.
-    """
-    if x < m or x >= m + width:
-        return x
-    block = (x - m) // f
-    if block < slot:
-        return x
-    if (by < 0 and block == slot) or (by > 0 and x + f >= m + width):
-        return -1
-    return x + by * f
+def node_of(kind, i, slot, by, q, kinds):
+    """The number of the node of row i, of that without the event in a slot, or of that with kind q in it; of so many kinds."""
+    code, place = 0, 1
+    for a in range(kind.shape[1]):
+        if by == MORE and a == slot:
+            code += (q + 1) * place
+            place *= kinds + 1
+        if kind[i, a] >= 0 and not (by == LESS and a == slot):
+            code += (kind[i, a] + 1) * place
+            place *= kinds + 1
+    return code
 
 
 @helper
-def changed(X, P, kind, onset, held, i, m, f, slot, by, room):
-    """Into the room the hypothesis of row i without the event in a slot (by -1), or with that slot free (by 1)."""
-    mean, cov, key, onset1, held1 = room
-    E, N, width = key.size, mean.size, key.size * f
+def of_node(code, log, node, into):
+    """How many rows a node has, their numbers in the first of `into`."""
+    count = 0
+    for i in range(1, log.size):
+        if code[i] == node and log[i] > NEVER:
+            into[count] = i
+            count += 1
+    return count
+
+
+@helper
+def derive(kind, onset, held, i, m, f, slot, by, room):
+    """Into the room what becomes of row i."""
+    key, onset1, held1, origin = room
+    E = key.size
     for a in range(E):
         key[a], onset1[a] = -1, 0.0
         for b in range(held1.shape[1]):
             held1[a, b] = 0.0
     for a in range(E):
         to = a + by if a >= slot else a
-        if kind[i, a] >= 0 and (by > 0 or a != slot):
+        if kind[i, a] >= 0 and not (by == LESS and a == slot):
             key[to], onset1[to] = kind[i, a], onset[i, a]
             for b in range(held1.shape[1]):
                 held1[to, b] = held[i, a, b]
-    for x in range(N):
-        mean[x] = 0.0
-        for y in range(N):
-            cov[x, y] = 0.0
-    for x in range(N):
-        to = place_in(x, m, f, width, slot, by)
-        if to >= 0:
-            mean[to] = X[i, x]
-            for y in range(N):
-                other = place_in(y, m, f, width, slot, by)
-                if other >= 0:
-                    cov[to, other] = P[i, x, y]
+    for x in range(origin.size):
+        origin[x] = x
+    for x in range(m + slot * f, m + E * f):
+        origin[x] = x - by * f
+        if (by == MORE and x < m + (slot + 1) * f) or origin[x] >= m + E * f:
+            origin[x] = -1
 
 
 @helper
-def hold(X, P, kind, onset, held, t, room):
-    """Row t becomes the hypothesis in the room."""
-    mean, cov, key, onset1, held1 = room
+def hold(X, P, kind, onset, held, t, i, room):
+    """Row t becomes what the room says of row i."""
+    key, onset1, held1, origin = room
     for a in range(key.size):
         kind[t, a], onset[t, a] = key[a], onset1[a]
         for b in range(held1.shape[1]):
             held[t, a, b] = held1[a, b]
-    for x in range(mean.size):
-        X[t, x] = mean[x]
-        for y in range(mean.size):
-            P[t, x, y] = cov[x, y]
+    for x in range(origin.size):
+        a = origin[x]
+        X[t, x] = X[i, a] if a >= 0 else 0.0
+        for y in range(origin.size):
+            b = origin[y]
+            P[t, x, y] = P[i, a, b] if a >= 0 and b >= 0 else 0.0
 
 
 @helper
-def merge(X, P, log, onset, held, t, weight, mean, cov, onset1, held1):
-    """Row t becomes the mixture of itself and a hypothesis of its node with this log weight."""
+def merge(X, P, log, onset, held, t, weight, i, room):
+    """Row t becomes the mixture of itself and, with this log weight, what the room says of row i, which is of its node."""
+    _, onset1, held1, origin = room
     total = np.logaddexp(log[t], weight)
     w = np.exp(weight - total)
     log[t] = total
     if w < WITHOUT:
         return
-    N = mean.size
-    for i in range(N):
-        gap = mean[i] - X[t, i]
-        for j in range(i + 1):
-            between = w * (1.0 - w) * gap * (mean[j] - X[t, j])
-            P[t, i, j] = P[t, j, i] = (1.0 - w) * P[t, i, j] + w * cov[i, j] + between
-    for i in range(N):
-        X[t, i] += w * (mean[i] - X[t, i])
+    for x in range(origin.size):
+        a = origin[x]
+        gap = (X[i, a] if a >= 0 else 0.0) - X[t, x]
+        for y in range(x + 1):
+            b = origin[y]
+            between = w * (1.0 - w) * gap * ((X[i, b] if b >= 0 else 0.0) - X[t, y])
+            other = P[i, a, b] if a >= 0 and b >= 0 else 0.0
+            P[t, x, y] = P[t, y, x] = (1.0 - w) * P[t, x, y] + w * other + between
+    for x in range(origin.size):
+        a = origin[x]
+        X[t, x] += w * ((X[i, a] if a >= 0 else 0.0) - X[t, x])
     for j in range(onset1.size):
         onset[t, j] += w * (onset1[j] - onset[t, j])
         if w > 0.5:
             for a in range(held.shape[2]):
                 held[t, j, a] = held1[j, a]
-
-
-@helper
-def of_node(kind, log, key, into):
-    """How many rows a node has, their numbers in the first of `into`."""
-    count = 0
-    for i in range(1, log.size):
-        if log[i] > NEVER and same(kind, i, key):
-            into[count] = i
-            count += 1
-    return count
 
 
 @helper
@@ -167,7 +158,7 @@ def place_for(log, weight):
 
 
 @helper
-def squeezed(X, P, log, kind, onset, held, rows, count, step, every):
+def squeezed(X, P, log, kind, onset, held, m, f, rows, count, step, every, room):
     """Of a node's rows those two become one that are least likely for how close their onsets are; the free row."""
     for a in range(1, count):  # in the order of their onsets
         b = a
@@ -182,6 +173,7 @@ def squeezed(X, P, log, kind, onset, held, rows, count, step, every):
         if cost < least:
             best, least = a, cost
     a, b = rows[best], rows[best + 1]
-    merge(X, P, log, onset, held, a, log[b], X[b], P[b], onset[b], held[b])
+    derive(kind, onset, held, b, m, f, 0, AS_IT_IS, room)
+    merge(X, P, log, onset, held, a, log[b], b, room)
     log[b] = NEVER
     return b

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -11,12 +12,12 @@ from baselines.learned import features as feat
 from baselines.learned import streams
 from baselines.learned.features import FeatureModel, FeatureShape
 from baselines.learned.weights import MISSING
-from fdi_gym.diagnosis import Diagnosis, make_diagnoser, run
+from fdi_gym.diagnosis import Diagnoser, Diagnosis, make_diagnoser, run
 from fdi_gym.discovery import load_plant
 from fdi_gym.engine import Record, simulate
 from fdi_gym.faults import FaultScenario
 from fdi_gym.metrics import scored_samples
-from fdi_gym.plant import Array, Plant
+from fdi_gym.plant import Array, NotApplicableError, Plant
 from fdi_gym.scores import balanced_accuracy
 from fdi_gym.suite import chained
 
@@ -136,6 +137,34 @@ def at_samples(answers: Array, period: int, samples: int) -> Array:
     return np.concatenate([early, held, np.repeat(held[:, -1:], rest, axis=1)], axis=1)
 
 
+def shown_filter(name: str, plant: Plant, process: str) -> Diagnoser:
+    """A filter that a network is shown; where it does not apply to the process, one that is lost from the start.
+
+    Raises:
+        NotApplicableError: It applies to no process of the plant.
+    """
+    try:
+        return make_diagnoser(name, plant, process=process)
+    except NotApplicableError:
+        for other in plant.processes:
+            with suppress(NotApplicableError):
+                return _lost(make_diagnoser(name, plant, process=other), plant)
+        raise
+
+
+def _lost(filter: Diagnoser, plant: Plant) -> Diagnoser:
+    """Who says nothing in place of a filter, as lost ones do."""
+    _, said = filter.update(filter.init(1), np.array([[s.nominal for s in plant.observed]]))
+    wide = {name: a for name in ("estimate", "estimate_std", "label_probs") if (a := getattr(said, name)) is not None}
+
+    def update(state: Array, obs: Array) -> tuple[Array, Diagnosis]:
+        n = len(obs)
+        nothing = {name: np.full((n, a.shape[1]), np.nan) for name, a in wide.items()}
+        return state, Diagnosis(np.zeros(n, bool), np.full(n, -1), **nothing)
+
+    return Diagnoser(np.zeros, update, gaps=True)
+
+
 def filter_features(plant: Plant, diagnosis: Diagnosis) -> Array:
     """A filter's diagnosis as features (n, ...): its label, probabilities, estimate and spread."""
     labels = len(plant.labels)
@@ -156,7 +185,7 @@ def filters_features(
     """What `filter_features` has of each filter at the newest sample of each step: (N, T, ...), float32."""
     found = []
     for name in filters:
-        decisions = run(make_diagnoser(name, plant, process=condition.process), obs)
+        decisions = run(shown_filter(name, plant, condition.process), obs)
         n, samples = decisions.label.shape
         steps = samples // period
         flat = [

@@ -127,8 +127,8 @@ FILTERS = {  # that residual_net is shown, and training flights per condition: f
     "B747Lateral": (("onset_bank", "switching_bayes_bank"), 600),
     "HUAVHover": (("overlap_bank", "hypothesis_bank"), 240),
     "MissilePitch": (("onset_bank_fine", "augmented_ekf_imm"), 240),
-    "CMGSatellite": (("mekf",), 400),
-    "ThreeTank": (("augmented_ekf", "multiple_model_ekf"), 600),
+    "CMGSatellite": (("multiple_model_ekf", "overlap_bank"), 240),
+    "ThreeTank": (("onset_bank", "multiple_model_ekf"), 400),
 }
 # fault windows in a flight that networks are shown, and their pace: whole flights are long, and its suites are so too
 WINDOWS = {"CMGSatellite": {"standard": (3, 0.2), "mixed": (3, 0.1)}}

@@ -61,27 +61,27 @@ def told_events_oracle(
     def start(n: int) -> Told:
         return Told(bank.start(n), *label_changes(plant, scenarios, n))
 
-    def begun(s: Hypotheses, step: Array, u: Array) -> Hypotheses:
-        """A fault begins, of whichever kind: nothing else is possible any more."""
-        return bank.begun(s, step, u, np.ones((len(step), 1)), np.zeros(0))[0]
-
-    def over(s: Hypotheses) -> Hypotheses:
-        """No fault acts any more: the healthy filter is the mixture of all."""
-        X, P, log, own = s.X.copy(), s.P.copy(), np.full(s.log.shape, NEVER), slice(bank.m, bank.m + bank.width)
-        X[..., own], P[..., own, :], P[..., own] = 0.0, 0.0, 0.0
-        mean, covariance = mixture(np.exp(s.log)[:, None], X, P)
-        X[:, 0], P[:, 0], log[:, 0] = mean[:, 0], covariance[:, 0], 0.0
-        return s._replace(X=X, P=P, log=log)
+    def over(s: Hypotheses, ends: Array) -> Hypotheses:
+        """No fault acts any more in some episodes: the healthy filter is the mixture of all."""
+        own, each = slice(bank.m, bank.m + bank.width), np.arange(len(ends))
+        part, found = (s.X[ends], s.P[ends]), (s.X.copy(), s.P.copy(), s.log.copy())
+        part[0][..., own], part[1][..., own, :], part[1][..., own] = 0.0, 0.0, 0.0
+        (X, P), log = mixture(np.exp(s.log[ends])[:, None], *part), np.full((len(ends), bank.count), NEVER)
+        log[:, 0] = 0.0
+        found[0][ends, 0], found[1][ends, 0], found[2][ends] = X[each, 0], P[each, 0], log
+        return s._replace(X=found[0], P=found[1], log=found[2])
 
     def predict(s: Told, at: Interval) -> Told:
         each, k = np.arange(len(at.k)), np.minimum(at.k, s.acts.shape[1] - 1)
         found, ends = s.bank, np.flatnonzero(s.changes[each, k])
         if ends.size:
-            found = found.put(ends, over(found.of(ends)))
+            found = over(found, ends)
         begins = ends[s.acts[ends, k[ends]]]
-        if begins.size:
-            found = found.put(begins, begun(found.of(begins), at.k[begins] - 1, at.u[begins]))
-        return s._replace(bank=bank.moved(found, at))
+        if begins.size:  # of whichever kind: nothing else is possible any more
+            found, _ = bank.begun(
+                found, begins, at.k[begins] - 1, at.u[begins], np.ones((len(begins), 1)), np.zeros(0)
+            )
+        return s._replace(bank=bank.moved(found, at, np.empty(found.X.shape), np.empty(found.P.shape)))
 
     def update(s: Told, at: Interval, y: Array, seen: Array) -> Told:
         return s._replace(bank=bank.update(s.bank, at, y, seen))

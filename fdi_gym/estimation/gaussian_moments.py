@@ -24,7 +24,6 @@ from fdi_gym.estimation.gaussian_algebra import entry
 from fdi_gym.estimation.gaussian_points import (
     DISTURBANCES,
     ENTRIES,
-    EVERY,
     KNOWN,
     OUTPUT,
     OUTPUTS,
@@ -35,6 +34,7 @@ from fdi_gym.estimation.gaussian_points import (
     SUBSTEPS,
     TANGENT,
     THETA,
+    change_magnitude,
     enters,
     moments_of_points,
     pass_points,
@@ -99,7 +99,9 @@ def sensed(integers, reals, step, offset, direction, t, X, u, known, room, x, y,
         x[i] = X[i]
     for i in range(d.size):
         d[i] = known[i]
-    put_magnitudes(integers, offset, direction, X, EVERY, reals[1:], now)
+    put_magnitudes(integers, offset, direction, X, reals[1:], now)
+    middle = floats(now.size)
+    put(now, middle)
     for j in range(-1, N):  # first the mean
         if j >= n_x and not enters(False, integers, direction, j):
             for a in range(m):
@@ -109,7 +111,7 @@ def sensed(integers, reals, step, offset, direction, t, X, u, known, room, x, y,
             if j >= 0:
                 x[j] = X[j] + step[j] if side == 0 else X[j] - step[j]
             if n_x <= j < n_x + n_m:
-                put_magnitudes(integers, offset, direction, x, j - n_x, reals[1:], now)
+                change_magnitude(integers, direction, j - n_x, x[j] - X[j], middle, now)
             for i in range(n_d):
                 d[integers[SIZES + p + i]] = x[n_x + n_m + i]
             output(t, state, u, theta, d, physical, y)
@@ -127,7 +129,7 @@ def sensed(integers, reals, step, offset, direction, t, X, u, known, room, x, y,
         if j >= 0:
             x[j] = X[j]
         if n_x <= j < n_x + n_m:
-            put_magnitudes(integers, offset, direction, x, j - n_x, reals[1:], now)
+            change_magnitude(integers, direction, j - n_x, 0.0, middle, now)
 
 
 @inlined
@@ -224,7 +226,7 @@ def differentiated(integers, reals, step, offset, direction, t, X, u, known, roo
     now, theta, physical, d, L, used = room
     n, own, n_D = integers[STATES], integers[OWN], integers[KNOWN]
     n_theta, p, n_d, n_m, count = integers[THETA], integers[ENTRIES], integers[DISTURBANCES], direction.shape[1], 0
-    put_magnitudes(integers, offset, direction, X, EVERY, reals[1:], now)
+    put_magnitudes(integers, offset, direction, X, reals[1:], now)
     for e in range(p):
         i = integers[SIZES + e]
         if i < own or i >= n_theta:  # else it is a fault of a sensor

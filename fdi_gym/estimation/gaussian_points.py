@@ -14,22 +14,26 @@ EXTENDED, UNSCENTED, CENTRAL_DIFFERENCE = 0, 1, 2
 # The integers of a model: three addresses (the last may be 0), sizes, then the lists (entries, disturbances, sensors)
 OF_LANES, OUTPUT, TANGENT, ADDRESSES = range(4)
 SUBSTEPS, STATES, OUTPUTS, THETA, KNOWN, ENTRIES, DISTURBANCES, SENSORS, OWN, COMMANDS, SIZES = range(ADDRESSES, 14)
-EVERY = -1  # magnitude
 
 
 @helper
-def put_magnitudes(integers, offset, direction, X, of, nominal, now):
-    """Into theta and the physical parameters, what the magnitudes in X make of the entries that magnitude `of` moves.
-
-    Of EVERY magnitude: all entries on the line.
-    """
+def put_magnitudes(integers, offset, direction, X, nominal, now):
+    """Into theta and the physical parameters, what the magnitudes in X make of the entries on the line."""
     n_x = integers[STATES]
     for e in range(integers[ENTRIES]):
-        if of == EVERY or direction[e, of] != 0.0:
-            i, deviation = integers[SIZES + e], offset[e]
-            for j in range(direction.shape[1]):
-                deviation += direction[e, j] * X[n_x + j]
-            now[i] = nominal[i] + deviation
+        i, deviation = integers[SIZES + e], offset[e]
+        for j in range(direction.shape[1]):
+            deviation += direction[e, j] * X[n_x + j]
+        now[i] = nominal[i] + deviation
+
+
+@helper
+def change_magnitude(integers, direction, j, by, middle, now):
+    """The entries that magnitude j moves, from their values in the middle, where it is larger by so much."""
+    for e in range(integers[ENTRIES]):
+        if direction[e, j] != 0.0:
+            i = integers[SIZES + e]
+            now[i] = middle[i] + direction[e, j] * by
 
 
 @helper
@@ -67,7 +71,7 @@ def read_points(integers, reals, offset, direction, t, points, u, known, values)
     theta, theta_p, physical = now[:n_theta], now[:own], now[n_theta:]  # beyond the plant's own are faults of the sensors
     for i in range(points.shape[0]):
         if other_magnitudes(integers, direction, points, i):
-            put_magnitudes(integers, offset, direction, points[i], EVERY, nominal, now)
+            put_magnitudes(integers, offset, direction, points[i], nominal, now)
         for j in range(n_d):
             d[disturbances[j]] = points[i, n_x + n_m + j]
         for j in range(n_x):
@@ -98,7 +102,7 @@ def move_points(integers, reals, offset, direction, t, points, u, known, values)
         for lane in range(LANES):
             i = min(first + lane, M - 1)
             if other_magnitudes(integers, direction, points, i):
-                put_magnitudes(integers, offset, direction, points[i], EVERY, nominal, now)
+                put_magnitudes(integers, offset, direction, points[i], nominal, now)
             for j in range(n_d):
                 D[lane, disturbances[j]] = points[i, n_x + n_m + j]
             for j in range(n_x):
