@@ -167,7 +167,10 @@ def measured(plant_id, budget, gaps, work):
             found[condition.name]["reference"] = reference
         print(plant_id, condition.name, found[condition.name], flush=True)
     return {
-        "budgets": budgets, "filters": list(recipe.filters), "validation": recipe.validation, "curves": found,
+        "budgets": budgets,
+        "filters": list(recipe.filters),
+        "validation": recipe.validation,
+        "curves": found,
     }
 
 
@@ -193,7 +196,11 @@ def section(found):
         line = [name, *(f"{score:.1f}" for score in curve["scores"]), f"{slope:+.1f} [{least:+.1f}, {most:+.1f}]"]
         if "gaps" in curve:
             gap, low, high = curve["gaps"][-1]
-            line += [f"{curve['attained']:.1f} ({curve['reference']})", f"{gap:.1f} [{low:.1f}, {high:.1f}]", forecast(curve, budgets[-1])]
+            line += [
+                f"{curve['attained']:.1f} ({curve['reference']})",
+                f"{gap:.1f} [{low:.1f}, {high:.1f}]",
+                forecast(curve, budgets[-1]),
+            ]
         rows.append(line + ["-"] * (len(budgets) + 5 - len(line)))
     head = ["condition", *flights, "a doubling", "attained by", "gap", "flights that close it"]
     shown = " and ".join(f"`{name}`" for name in found["filters"])

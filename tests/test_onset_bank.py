@@ -209,7 +209,9 @@ def test_events_that_end_give_their_weight_to_health_and_what_was_never_faulty_k
     all_of = np.arange(5)
     after = bank.renewed(s, all_of, step, np.tile(bank.plant.trim_command, (5, 1)))
     assert_allclose(np.exp(after.log).sum(axis=1), 1.0)
-    healthy = np.exp(after.log[:, 0]) / (1.0 - bank.chances(s._replace(first=after.first, since=after.since), all_of, step)[:, 0])
+    healthy = np.exp(after.log[:, 0]) / (
+        1.0 - bank.chances(s._replace(first=after.first, since=after.since), all_of, step)[:, 0]
+    )
     assert (healthy > np.exp(log[:, 0])).all()
     assert_allclose(after.first * healthy, s.first * np.exp(log[:, 0]), rtol=1e-6)
 

@@ -147,6 +147,27 @@ def test_no_weight_is_lost_when_events_end_and_begin():
     assert (s.kind[..., 1] >= 0).any()
 
 
+def test_what_begins_has_a_place_where_its_kind_is_full_however_unlikely_it_is():
+    """Two of its kind become one for it; elsewhere it needs a place that is free, or less likely."""
+    plant = build("HUAVHover")
+    events = events_of(plant, [draw(plant.process("standard"), FIRST + i) for i in range(400)])
+    r, u = len(events.label), np.tile(plant.trim_command, (1, 1))
+    bank = Bank(plant, fit_belief(plant, "standard"), events, 2, 1, 1 + 2 * r)
+    s, one = bank.start(1), np.arange(1)
+    for step in range(2):  # no two act at once: the table fills with two onsets of each kind
+        s, _ = bank.begun(s, one, np.array([step]), u, np.array([[0.3, 1e-300]]), np.zeros(0))
+    assert (s.log > -1e300).all() and (s.kind[0, 1:, 1] < 0).all()
+    s = s._replace(log=s.log + np.where(np.arange(1 + 2 * r) > 0, 20.0, 0.0))
+    after, _ = bank.begun(s, one, np.array([2]), u, np.array([[0.1, 1e-300]]), np.zeros(0))
+    newest = after.kind[0, after.onset[0, :, 0] == 2, 0]
+    assert sorted(newest[newest >= 0]) == list(range(r))
+    one_less = s._replace(kind=np.where(np.arange(1 + 2 * r)[:, None] == 1, [[0, 1]], s.kind[0])[None])  # of its kind
+    missing = s.kind[0, 1, 0]
+    after, _ = bank.begun(one_less, one, np.array([2]), u, np.array([[0.1, 1e-300]]), np.zeros(0))
+    newest = after.kind[0, after.onset[0, :, 0] == 2, 0]
+    assert sorted(newest[newest >= 0]) == [q for q in range(r) if q != missing]
+
+
 # -- as a diagnoser
 
 

@@ -69,6 +69,8 @@ class Bank:
         (r, p, self.f), (e, c) = events.direction.shape, events.spread.shape
         self.E, self.count = 1 + len(events.more), 1 + r * onsets if count is None else count
         self.width = self.E * self.f
+        if (1 + r) ** self.E >= 2**62:  # the number of a node
+            raise NotApplicableError(f"events of {r} kinds, {self.E} at once, are more sets than can be numbered")
         R = plant.R[np.ix_(belief.sensors, belief.sensors)]  # errors of the model are known or estimated, not noise
         base = augmented(plant, msgspec.structs.replace(belief, Q=floored(plant, plant.Q), R=R) if e else belief)
         entries = np.concatenate([events.entries, len(plant.theta) + events.physical])
@@ -177,7 +179,23 @@ class Bank:
         """Probabilities of the labels, and the mean of the fault vector."""
         n, (j, at) = len(s.log), self.known
         probs, z, x = np.zeros((n, len(self.plant.labels))), np.zeros((n, self.p)), np.zeros((n, len(self.plant.states)))
-        tell(s.log, s.kind, s.length, s.held, s.X, self.m, self.does, self.events.modes, self.sets, self.labels, j, at, probs, z, x)
+        tell(
+            s.log,
+            s.kind,
+            s.length,
+            s.held,
+            s.X,
+            self.m,
+            self.does,
+            self.events.modes,
+            self.sets,
+            self.labels,
+            j,
+            at,
+            probs,
+            z,
+            x,
+        )
         return Reading(z, x=x, nu=s.nu, S=s.S, probs=probs)
 
     def expect(self, s: Hypotheses, at: Interval) -> Array:
@@ -197,6 +215,17 @@ def events_of_process(plant: Plant, process: str, courses: int, sizes: int) -> E
         raise NotApplicableError("sensors that fail by noise, freezing or spikes are no lines in theta")
     drawn = [plant.draw(process, VALIDATION_SEED + FIRST + i) for i in range(DRAWN)]
     return events_of(plant, drawn, courses=courses, sizes=sizes)
+
+
+def one_after_another(events: Events) -> Events:
+    """The events, which follow one another.
+
+    Raises:
+        NotApplicableError: They overlap.
+    """
+    if events.more.size:
+        raise NotApplicableError("faults of this process overlap in time: overlap_bank is for those")
+    return events
 
 
 def at_least(least: int, **numbers: int) -> None:

@@ -17,11 +17,11 @@ from baselines.filters.hypothesis_kernels import (
     allowed,
     derive,
     hold,
+    least_likely,
     likeliest,
     merge,
     node_of,
     of_node,
-    place_for,
     squeezed,
 )
 from fdi_gym.kernels import M, V, bools, compiled, floats, helper, ints
@@ -56,8 +56,8 @@ def end(X, P, log, kind, onset, held, step, stays, every, m, f, kinds, code, roo
                         if t < 0 or log[rows[a]] > log[t]:
                             t = rows[a]
                     if t < 0:
-                        t = place_for(log, weight)
-                        if t >= 0:
+                        t = least_likely(log)
+                        if log[t] < weight:
                             derive(kind, onset, held, i, m, f, j, LESS, room)
                             hold(X, P, kind, onset, held, t, i, room)
                             log[t], code[t] = weight, node
@@ -108,28 +108,47 @@ def may_begin(kind, i, masks, sets, prior, may):
 
 
 @helper
-def begin(X, P, log, kind, onset, held, step, chance, every, m, f, keep, masks, sets, prior, M0, fresh, code, room, rows, of):
+def beside(kind, log, i, number):
+    """How many rows have the events of row i and one more, by the kind of that."""
+    count = acting(kind, i)
+    number[:] = 0
+    for other in range(1, log.size):
+        if log[other] > NEVER and acting(kind, other) == count + 1:
+            both, more = 0, -1
+            for a in range(count + 1):
+                if both < count and kind[other, a] == kind[i, both]:
+                    both += 1
+                else:
+                    more = kind[other, a]
+            if both == count:
+                number[more] += 1
+
+
+@helper
+def begin(
+    X, P, log, kind, onset, held, step, chance, every, m, f, keep, masks, sets, prior, M0, fresh, code, room, rows, of
+):
     """Another event may begin with this step, of each kind that may act beside those that do: the newest hypotheses."""
     key, onset1, held1, _ = room
-    parents, weights, may = of
-    kinds, top = masks.size, likeliest(log)
+    parents, weights, may, number = of
+    kinds, top, worst = masks.size, likeliest(log), least_likely(log)
     for a in range(likely(log, kind, chance, top, code, rows, parents, weights)):
         i = parents[a]
         count, all_of = acting(kind, i), may_begin(kind, i, masks, sets, prior, may)
+        before = weights[a] + np.log(chance[count])
+        beside(kind, log, i, number)  # or fewer by now: what has begun since may have taken their places
         for q in range(kinds):
-            weight = weights[a] + np.log(chance[count]) + prior[q] - all_of
-            if not may[q] or (count > 0 and weight < top - NEGLIGIBLE):
+            weight = before + prior[q] - all_of
+            if not may[q] or (count > 0 and weight < top - NEGLIGIBLE) or (number[q] < keep and not log[worst] < weight):
                 continue
             slot = 0
             while slot < count and kind[i, slot] < q:
                 slot += 1
-            node = node_of(kind, i, slot, MORE, q, kinds)
+            node, t = node_of(kind, i, slot, MORE, q, kinds), worst
             some = of_node(code, log, node, rows)
             if some >= keep:
                 t = squeezed(X, P, log, kind, onset, held, m, f, rows, some, step, every, room)
-            else:
-                t = place_for(log, weight)
-            if t < 0 or t == i:
+            elif t == i or not log[t] < weight:
                 continue
             derive(kind, onset, held, i, m, f, slot, MORE, room)
             key[slot], onset1[slot] = q, step
@@ -139,6 +158,7 @@ def begin(X, P, log, kind, onset, held, step, chance, every, m, f, keep, masks, 
             for b in range(m + slot * f, m + (slot + 1) * f):
                 P[t, b, b] = M0[q, b - m - slot * f]
             log[t], code[t] = weight, node
+            worst = least_likely(log)
 
 
 @compiled(void(I1, M3, M4, M, I3, M3, M4, V, M, V, int64, int64, int64, int64, I1, I1, V, M, M3, V))
@@ -153,7 +173,7 @@ def renew(
     """
     (_, count, N), E, p, kinds = X.shape, kind.shape[2], held.shape[3], masks.size
     room = ints(E), floats(E), floats((E, p)), ints(N)
-    rows, code, leave, of = ints(count), ints(count), floats(E), (ints(count), floats(count), bools(kinds))
+    rows, code, leave, of = ints(count), ints(count), floats(E), (ints(count), floats(count), bools(kinds), ints(kinds))
     for a in range(turn.size):
         e = turn[a]
         for i in range(count):

@@ -146,15 +146,15 @@ def merge(X, P, log, onset, held, t, weight, i, room):
 
 
 @helper
-def place_for(log, weight):
-    """A row where nothing is, or what is has less weight than this; -1: there is none."""
+def least_likely(log):
+    """A row where nothing is, or else the least likely one beside the healthy."""
     worst = 1
     for i in range(1, log.size):
         if log[i] <= NEVER:
             return i
         if log[i] < log[worst]:
             worst = i
-    return worst if log[worst] < weight else -1
+    return worst
 
 
 @helper

@@ -9,7 +9,7 @@ share of all samples, which is the decision that balanced accuracy asks for.
 
 from __future__ import annotations
 
-from baselines.filters.event_bank import FIRST, Bank, at_least, diagnosing, events_of_process
+from baselines.filters.event_bank import FIRST, Bank, at_least, diagnosing, events_of_process, one_after_another
 from fdi_gym.diagnosis import Diagnoser, diagnoser
 from fdi_gym.diagnosis.fitting import VALIDATION_SEED
 from fdi_gym.estimation.belief import Belief
@@ -50,13 +50,12 @@ def onset_bank(
             when they begin.
     """
     at_least(2, onsets=onsets)
-    at_least(1, every=1 if every is None else every)
+    if every is not None:
+        at_least(1, every=every)
     drawn = [plant.draw(process, VALIDATION_SEED + FIRST + i) for i in range(FEW)]
     if any(s.faults for s in drawn) and len({tuple(f.onset for f in s.faults) for s in drawn}) == 1:
         raise NotApplicableError(
             "in this process faults begin at the same time in all flights: who is told it knows the onset"
         )
-    events = events_of_process(plant, process, courses, sizes)
-    if events.more.size:
-        raise NotApplicableError("faults of this process overlap in time: overlap_bank is for those")
+    events = one_after_another(events_of_process(plant, process, courses, sizes))
     return diagnosing(Bank(plant, belief, events, onsets, every or max(1, len(events.onset) // GRID)))

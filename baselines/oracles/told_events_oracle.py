@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.filters.event_bank import Bank, Hypotheses, events_of_process, most_telling
+from baselines.filters.event_bank import Bank, Hypotheses, events_of_process, most_telling, one_after_another
 from baselines.filters.hypothesis_kernels import NEVER
 from baselines.oracles.told_onset_ekf import label_changes
 from fdi_gym.diagnosis import Diagnoser, Filter, diagnoser, diagnoser_of
@@ -19,7 +19,7 @@ from fdi_gym.estimation.decision import Reading
 from fdi_gym.estimation.interval import Interval
 from fdi_gym.estimation.mixing import mixture
 from fdi_gym.faults import FaultScenario
-from fdi_gym.plant import Array, NotApplicableError, Plant
+from fdi_gym.plant import Array, Plant
 
 
 class Told(NamedTuple):
@@ -53,10 +53,8 @@ def told_events_oracle(
         NotApplicableError: As of `onset_bank`.
         ValueError (from init): The number of episodes is not that of the scenarios.
     """
-    events = events_of_process(plant, process, courses, sizes)
+    events = one_after_another(events_of_process(plant, process, courses, sizes))
     bank = Bank(plant, belief, events, onsets=2, every=1)
-    if events.more.size:
-        raise NotApplicableError("faults of this process overlap in time")
 
     def start(n: int) -> Told:
         return Told(bank.start(n), *label_changes(plant, scenarios, n))
@@ -78,9 +76,7 @@ def told_events_oracle(
             found = over(found, ends)
         begins = ends[s.acts[ends, k[ends]]]
         if begins.size:  # of whichever kind: nothing else is possible any more
-            found, _ = bank.begun(
-                found, begins, at.k[begins] - 1, at.u[begins], np.ones((len(begins), 1)), np.zeros(0)
-            )
+            found, _ = bank.begun(found, begins, at.k[begins] - 1, at.u[begins], np.ones((len(begins), 1)), np.zeros(0))
         return s._replace(bank=bank.moved(found, at, np.empty(found.X.shape), np.empty(found.P.shape)))
 
     def update(s: Told, at: Interval, y: Array, seen: Array) -> Told:
