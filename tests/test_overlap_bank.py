@@ -156,7 +156,8 @@ def test_what_begins_has_a_place_where_its_kind_is_full_however_unlikely_it_is()
     s, one = bank.start(1), np.arange(1)
     for step in range(2):  # no two act at once: the table fills with two onsets of each kind
         s, _ = bank.begun(s, one, np.array([step]), u, np.array([[0.3, 1e-300]]), np.zeros(0))
-    assert (s.log > -1e300).all() and (s.kind[0, 1:, 1] < 0).all()
+    assert (s.log > -1e300).all()
+    assert (s.kind[0, 1:, 1] < 0).all()
     s = s._replace(log=s.log + np.where(np.arange(1 + 2 * r) > 0, 20.0, 0.0))
     after, _ = bank.begun(s, one, np.array([2]), u, np.array([[0.1, 1e-300]]), np.zeros(0))
     newest = after.kind[0, after.onset[0, :, 0] == 2, 0]

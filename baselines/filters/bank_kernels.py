@@ -125,7 +125,8 @@ def wander(kind, rates, m, f, X, P):
 
 @compiled(void(int64, I1, V, V, V, M, BANK, V, int64, M3, V, M, M, M3, M4, M, I3, M3, M4, M3, M4))
 def move(
-    predict_lanes_at, integers, reals, step, limit, plant, bank, rates, m, Q, t, u, known, X, P, log, kind, length, held, X1, P1
+    predict_lanes_at, integers, reals, step, limit, plant, bank, rates, m, Q, t, u, known, X, P, log, kind, length, held,
+    X1, P1,
 ):  # fmt: skip
     """X1 (n, count, N) and P1 (n, count, N, N), which may be X and P, one sample after t; Q (1 or n, N, N)."""
     (n, count, N), E, f = X.shape, kind.shape[2], bank[1].shape[2]

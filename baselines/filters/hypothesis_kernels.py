@@ -56,7 +56,7 @@ def allowed(sets, modes):
 
 @helper
 def node_of(kind, i, slot, by, q, kinds):
-    """The number of the node of row i, of that without the event in a slot, or of that with kind q in it; of so many kinds."""
+    """The number of the node of row i, of it without the event in a slot, or of it with kind q there; of so many kinds."""
     code, place = 0, 1
     for a in range(kind.shape[1]):
         if by == MORE and a == slot:

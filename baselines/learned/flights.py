@@ -160,7 +160,7 @@ def _lost(filter: Diagnoser, plant: Plant) -> Diagnoser:
     def update(state: Array, obs: Array) -> tuple[Array, Diagnosis]:
         n = len(obs)
         nothing = {name: np.full((n, a.shape[1]), np.nan) for name, a in wide.items()}
-        return state, Diagnosis(np.zeros(n, bool), np.full(n, -1), **nothing)
+        return state, Diagnosis(np.zeros(n, bool), np.full(n, -1))._replace(**nothing)
 
     return Diagnoser(np.zeros, update, gaps=True)
 
