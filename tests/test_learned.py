@@ -316,6 +316,19 @@ def test_what_filters_say_is_the_same_in_another_process(plant_id):
         assert all(np.array_equal(a, b) for a, b in zip(here, there, strict=True))
 
 
+def test_a_filter_that_does_not_apply_to_a_process_is_shown_as_a_lost_one_as_wide_as_where_it_does():
+    plant = build("CMGSatellite")
+    obs, labels = flights.fly(plant, Condition("hard", {}), range(1)).obs[:, :8], len(plant.labels)
+    shown = [
+        flights.filters_features(plant, Condition(name, {}), ("overlap_bank",), obs, 4)[0] for name in ("standard", "hard")
+    ]
+    assert shown[0].shape == shown[1].shape
+    assert_allclose(shown[0], np.broadcast_to(np.arange(shown[0].shape[2]) == labels, shown[0].shape))
+    assert not np.allclose(shown[1][..., labels], 1.0)
+    with pytest.raises(NotApplicableError, match="no two faults overlap"):
+        flights.shown_filter("overlap_bank", build("B747Lateral"), "standard")
+
+
 def test_a_network_is_told_the_process_and_takes_an_unknown_one_for_the_first(tiny):
     plant = build("B747Lateral")
     obs = flights.fly(plant, Condition("standard", {}), range(VALIDATION, VALIDATION + 2)).obs[:, :200]
