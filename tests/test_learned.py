@@ -35,6 +35,7 @@ from baselines.learned.features import FeatureShape
 from baselines.learned.flights import CALIBRATION, PER_SEED, TEST, TRAINING, VALIDATION, Condition
 from baselines.learned.recipes import SequenceRecipe
 from fdi_gym.diagnosis import (
+    Diagnosis,
     NotApplicableError,
     diagnosers,
     find_diagnoser,
@@ -202,9 +203,9 @@ def test_streamed_diagnoses_are_those_of_the_whole_sequence(path):
     obs = record.obs[:, : 20 * shape.period + 3]
     seen = [streams.features(plant, shape, model, obs)]
     seen.append(flights.context(np.zeros(3, int), len(card.processes), 20))
-    told = flights.filters_features(plant, condition, card.filters, obs, shape.period)
+    told = flights.filters_features(plant, condition.process, card.processes, card.filters, obs, shape.period)
     x = torch.from_numpy(np.concatenate([*seen, *told], axis=2)).double()
-    widths = tuple(part.shape[2] for part in told)
+    widths = [np.zeros((len(plant.labels), part.shape[2])) for part in told]
     memory = "attention" if card.method == "attention_net" else "recurrent"
     size = (x.shape[2], len(plant.labels), len(plant.estimated), card.shape["hidden"], widths, len(card.processes), memory)
     net = SequenceNetwork(*size).double()
@@ -245,19 +246,35 @@ def test_loss_falls_on_a_fixed_batch():
 
 def test_an_untrained_network_believes_the_filters_it_is_shown():
     torch.manual_seed(0)
-    net = SequenceNetwork(8 + 2 + 4 + 6, 3, 2, 16, filters=(4, 6), processes=2)
+    net = SequenceNetwork(8 + 2 + 4 + 6, 3, 2, 16, filters=(3 * np.eye(3, 4), 2 * np.eye(3, 6)), processes=2)
     x = torch.zeros(2, 5, 20)
     x[0, :, 8] = x[1, :, 9] = 1.0  # the first expects one process, the second the other
     plain = net(x)[0]
     x[0, :, 10 + 1] = x[0, :, 14 + 1] = x[1, :, 10 + 2] = 1.0  # both filters say 1; the first says 2, the other nothing
     net.value.weight.data[:, 10:] = net.gate.weight.data[:, 10:] = net.join.weight.data[:, 10:20] = 0.0
     gain = net(x)[0] - plain
-    assert torch.allclose(gain[0], torch.tensor([0.0, 3.0, 0.0]), atol=1e-5)
-    assert torch.allclose(gain[1], torch.tensor([0.0, 0.0, 1.5]), atol=1e-5)
+    assert torch.allclose(gain[0], torch.tensor([0.0, 5.0, 0.0]), atol=1e-5)
+    assert torch.allclose(gain[1], torch.tensor([0.0, 0.0, 3.0]), atol=1e-5)
     net.direct.weight.data[:, :10] = 0.0  # trust of the first process
     gain = net(x)[0] - plain
     assert torch.allclose(gain[0], torch.zeros(3), atol=1e-5)
-    assert torch.allclose(gain[1], torch.tensor([0.0, 0.0, 1.5]), atol=1e-5)
+    assert torch.allclose(gain[1], torch.tensor([0.0, 0.0, 3.0]), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["multiple_model_ekf", "augmented_ekf_thresholds"])  # with probabilities, and without
+def test_what_an_untrained_network_believes_is_what_the_filter_means(name, b747):
+    filter, labels = make_diagnoser(name, b747), len(b747.labels)
+    said = flights.first_word(filter, b747)
+    rng, n = np.random.default_rng(0), 6
+    probs = None if said.label_probs is None else rng.dirichlet(np.ones(labels), n)
+    meant = rng.integers(0, labels, n)
+    further = {f: np.tile(a, (n, 1)) for f in ("estimate", "estimate_std") if (a := getattr(said, f)) is not None}
+    said = Diagnosis(np.zeros(n, bool), meant, label_probs=probs, **further)
+    logits = flights.filter_features(b747, said) @ flights.belief_in(b747, said).T
+    if probs is None:
+        assert_allclose(logits, flights.TRUST * np.eye(labels)[meant])
+    else:
+        assert_allclose(logits, np.log(probs), rtol=1e-12)
 
 
 @pytest.mark.parametrize(("plant_id", "filter"), [("DCMotor", "multiple_model_ekf"), ("B747Lateral", "two_stage_kf")])
@@ -287,12 +304,12 @@ def test_a_network_that_is_shown_filters_starts_from_one_that_is_not(plant_id, f
 
 
 @pytest.mark.parametrize("memory", ["recurrent", "attention"])
-@pytest.mark.parametrize("filters", [(), (4, 6)], ids=["alone", "filters"])
+@pytest.mark.parametrize("filters", [(), (np.eye(3, 4), np.eye(3, 6))], ids=["alone", "filters"])
 def test_a_step_on_numpy_is_a_step_of_the_network_that_was_trained(filters, memory, monkeypatch):
     monkeypatch.setattr(attention, "WINDOW", 5)  # shorter than what is shown
     monkeypatch.setattr(_attention, "WINDOW", 5)
     torch.manual_seed(0)
-    net = SequenceNetwork(8 + 2 + sum(filters), 3, 2, 16, filters, processes=2, memory=memory).double()
+    net = SequenceNetwork(8 + 2 + sum(a.shape[1] for a in filters), 3, 2, 16, filters, processes=2, memory=memory).double()
     for value in net.parameters():
         value.data.normal_(std=0.7)
     tensors = {name: value.numpy() for name, value in net.state_dict().items()}
@@ -309,7 +326,7 @@ def test_a_step_on_numpy_is_a_step_of_the_network_that_was_trained(filters, memo
 @pytest.mark.parametrize("plant_id", ["DCMotor", "B747Lateral"])  # of outside, and of the package
 def test_what_filters_say_is_the_same_in_another_process(plant_id):
     plant, condition = build(plant_id), Condition("standard", {})
-    arguments = (plant, condition, ("null", "random"), flights.fly(plant, condition, range(3)).obs[:, :40], 4)
+    arguments = (plant, "standard", ["standard"], ("null", "random"), flights.fly(plant, condition, range(3)).obs[:, :40], 4)
     here = flights.filters_features(*arguments)
     for there in joblib.Parallel(2)(joblib.delayed(flights.filters_features)(*arguments) for _ in range(2)):
         assert [a.shape[:2] for a in there] == [(3, 10), (3, 10)]
@@ -319,14 +336,13 @@ def test_what_filters_say_is_the_same_in_another_process(plant_id):
 def test_a_filter_that_does_not_apply_to_a_process_is_shown_as_a_lost_one_as_wide_as_where_it_does():
     plant = build("CMGSatellite")
     obs, labels = flights.fly(plant, Condition("hard", {}), range(1)).obs[:, :8], len(plant.labels)
-    shown = [
-        flights.filters_features(plant, Condition(name, {}), ("overlap_bank",), obs, 4)[0] for name in ("standard", "hard")
-    ]
+    processes = ("standard", "hard", "standard-dropout")
+    shown = [flights.filters_features(plant, name, processes, ("overlap_bank",), obs, 4)[0] for name in processes[:2]]
     assert shown[0].shape == shown[1].shape
     assert_allclose(shown[0], np.broadcast_to(np.arange(shown[0].shape[2]) == labels, shown[0].shape))
     assert not np.allclose(shown[1][..., labels], 1.0)
     with pytest.raises(NotApplicableError, match="no two faults overlap"):
-        flights.shown_filter("overlap_bank", build("B747Lateral"), "standard")
+        flights.shown_filter("overlap_bank", plant, "standard", ["standard"])
 
 
 def test_a_network_is_told_the_process_and_takes_an_unknown_one_for_the_first(tiny):

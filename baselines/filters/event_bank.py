@@ -151,15 +151,18 @@ class Bank:
             s = self.renewed(s, turn, step[turn], at.u[turn])
         return self.moved(s, at, s.X, s.P) if turn.size else self.moved(s, at, np.empty(s.X.shape), np.empty(s.P.shape))
 
+    def given(self, at: Interval) -> tuple[Array, Array]:
+        """The commands, and what is measured of the disturbances."""
+        return contiguous(at.u), self.model.compiled.unmeasured if at.d is None else contiguous(at.d)
+
     def moved(self, s: Hypotheses, at: Interval, X: Array, P: Array) -> Hypotheses:
         """All filters, over the interval: into X and P, which may be those of the state if nobody else has it."""
         bound, age = self.model.compiled, np.maximum(at.k[:, None, None] - s.onset, 0.0) * self.plant.dt
         length = contiguous(self.events.of(np.maximum(s.kind, 0), age))
-        integers, reals, step, *_ = bound.constants
         move(
-            address(predict_lanes), integers, reals, step, bound.limit, bound.linear, self.does, self.rates, self.m,
-            at.noise(self.model.noises[0]), (at.k - 1) * self.plant.dt, contiguous(at.u),
-            bound.unmeasured if at.d is None else contiguous(at.d), s.X, s.P, s.log, s.kind, length, s.held, X, P,
+            address(predict_lanes), *bound.constants[:3], bound.limit, bound.linear, self.does, self.rates, self.m,
+            at.noise(self.model.noises[0]), (at.k - 1) * self.plant.dt, *self.given(at), s.X, s.P, s.log, s.kind, length,
+            s.held, X, P,
         )  # fmt: skip
         return s._replace(X=X, P=P, u=at.u, length=length)
 
@@ -167,11 +170,10 @@ class Bank:
         """Weigh and correct those that run; of those that have become negligible the place is free."""
         bound, heard = self.model.compiled, self.model.sensors
         X, P, log, nu, S = np.empty(s.X.shape), np.empty(s.P.shape), s.log.copy(), np.empty(s.nu.shape), np.empty(s.S.shape)
-        integers, reals, step, *_ = bound.constants
         weigh(
-            address(update_lanes), integers, reals, step, bound.H, bound.plain, self.does, GIVEN_UP, self.model.noises[1],
-            at.k * self.plant.dt, contiguous(at.u), bound.unmeasured if at.d is None else contiguous(at.d),
-            y.take(heard, axis=1), seen.take(heard, axis=1), s.X, s.P, s.kind, s.length, s.held, X, P, log, nu, S,
+            address(update_lanes), *bound.constants[:3], bound.H, bound.plain, self.does, GIVEN_UP, self.model.noises[1],
+            at.k * self.plant.dt, *self.given(at), y.take(heard, axis=1), seen.take(heard, axis=1), s.X, s.P, s.kind,
+            s.length, s.held, X, P, log, nu, S,
         )  # fmt: skip
         return s._replace(X=X, P=P, log=log, nu=nu, S=S)
 
@@ -180,22 +182,9 @@ class Bank:
         n, (j, at) = len(s.log), self.known
         probs, z, x = np.zeros((n, len(self.plant.labels))), np.zeros((n, self.p)), np.zeros((n, len(self.plant.states)))
         tell(
-            s.log,
-            s.kind,
-            s.length,
-            s.held,
-            s.X,
-            self.m,
-            self.does,
-            self.events.modes,
-            self.sets,
-            self.labels,
-            j,
-            at,
-            probs,
-            z,
-            x,
-        )
+            s.log, s.kind, s.length, s.held, s.X, self.m, self.does, self.events.modes, self.sets, self.labels, j, at,
+            probs, z, x,
+        )  # fmt: skip
         return Reading(z, x=x, nu=s.nu, S=s.S, probs=probs)
 
     def expect(self, s: Hypotheses, at: Interval) -> Array:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from baselines.learned._attention import Attention
 from baselines.learned.sequence_net import LOG_STD, REACH
-
-TRUST = 3.0  # in the filters' labels before training: a logit
+from fdi_gym.plant import Array
 
 
 class SequenceNetwork(nn.Module):
@@ -25,15 +27,15 @@ class SequenceNetwork(nn.Module):
         labels: Labels of the isolation task.
         estimated: Entries of the identification task.
         hidden: Width of every layer.
-        filters: Entries of what each filter says, at the end of an input. They reach the logits directly, too: an
-            untrained network believes the labels that the filters declare, and training corrects that, for each process
-            apart.
+        filters: What takes the features of each filter, at the end of an input, to logits as it means them (labels, ...).
+            They reach the logits directly, too: an untrained network believes what the filters say, and training corrects
+            that, for each process apart.
         processes: Entries before these that say which fault process to expect: 1 for one, 0 for the others.
         memory: "recurrent" or "attention".
     """
 
     def __init__(
-        self, features: int, labels: int, estimated: int, hidden: int, filters: tuple[int, ...] = (), processes: int = 1,
+        self, features: int, labels: int, estimated: int, hidden: int, filters: Sequence[Array] = (), processes: int = 1,
         memory: str = "recurrent",
     ):  # fmt: skip
         super().__init__()
@@ -43,11 +45,11 @@ class SequenceNetwork(nn.Module):
         self.memory = Attention(hidden) if memory == "attention" else nn.GRU(hidden, hidden, batch_first=True)
         self.read = nn.Linear(hidden, hidden)
         self.heads = nn.Linear(hidden, labels + 2 * estimated)
-        self.told, self.processes = sum(filters), processes
+        self.told, self.processes = sum(a.shape[1] for a in filters), processes
         if filters:
             self.direct = nn.Linear(processes * self.told, labels, bias=False)
-            believe = [torch.eye(labels, width) * TRUST / REACH / len(filters) for width in filters]
-            self.direct.weight.data = torch.cat(believe * processes, dim=1)
+            believed = np.concatenate([*filters] * processes, axis=1) / REACH
+            self.direct.weight.data = torch.from_numpy(believed.astype(np.float32))
 
     def forward(self, x: Tensor, h: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Features (N, T, n) after the memory h (1, N, hidden): logits, mean, log std (N, T, ...), and the memory."""

@@ -72,13 +72,11 @@ class SupervisedTraining(Training[SequenceRecipe]):
         """The network and its optimiser."""
         p, r = self.plant, self.recipe
         self.model = model
-        widths: tuple[int, ...] = ()
-        if r.filters:
-            obs = data.fly(p, r.conditions[0], [self.first]).obs[:, : 2 * r.shape.period]
-            found = data.filters_features(p, r.conditions[0], r.filters, obs, r.shape.period)
-            widths = tuple(f.shape[-1] for f in found)
-        inputs = len(model.mean) + len(r.conditions) + sum(widths)
-        sizes = (inputs, len(p.labels), len(p.estimated), r.hidden, widths, len(r.conditions), r.memory)
+        processes = [c.process for c in r.conditions]
+        shown = [data.shown_filter(name, p, processes[0], processes) for name in r.filters]
+        believed = [data.belief_in(p, data.first_word(filter, p)) for filter in shown]
+        inputs = len(model.mean) + len(processes) + sum(a.shape[1] for a in believed)
+        sizes = (inputs, len(p.labels), len(p.estimated), r.hidden, believed, len(processes), r.memory)
         self.network = SequenceNetwork(*sizes).to(self.device)
         self.optimiser = torch.optim.AdamW(self.network.parameters(), lr=r.rate, weight_decay=r.decay)
 

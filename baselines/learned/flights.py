@@ -24,6 +24,8 @@ from fdi_gym.suite import chained
 # the first seed of each split, which ends where the next begins
 TEST, VALIDATION, CALIBRATION, TRAINING = 1_000_000, 2_000_000, 2_500_000, 3_000_000
 PER_SEED = 1_000_000  # training seeds that belong to one seed of a run
+LOGIT = 5.0  # one of a filter's log probabilities, in features
+TRUST = 3.0  # in the label of a filter without probabilities: a logit
 
 
 class Condition(NamedTuple):
@@ -137,24 +139,35 @@ def at_samples(answers: Array, period: int, samples: int) -> Array:
     return np.concatenate([early, held, np.repeat(held[:, -1:], rest, axis=1)], axis=1)
 
 
-def shown_filter(name: str, plant: Plant, process: str) -> Diagnoser:
+def shown_filter(name: str, plant: Plant, process: str, processes: Sequence[str]) -> Diagnoser:
     """A filter that a network is shown; where it does not apply to the process, one that is lost from the start.
 
+    Args:
+        name: The filter's.
+        plant: The plant.
+        process: That it is built for.
+        processes: Those that the network is trained on, names of a `Condition`.
+
     Raises:
-        NotApplicableError: It applies to no process of the plant.
+        NotApplicableError: It applies to none of these.
     """
     try:
         return make_diagnoser(name, plant, process=process)
     except NotApplicableError:
-        for other in plant.processes:
+        for other in dict.fromkeys(known.removesuffix(MISSING) for known in processes):
             with suppress(NotApplicableError):
                 return _lost(make_diagnoser(name, plant, process=other), plant)
         raise
 
 
+def first_word(filter: Diagnoser, plant: Plant) -> Diagnosis:
+    """What a filter says when all is at rest: (1, ...)."""
+    return filter.update(filter.init(1), np.array([[s.nominal for s in plant.observed]]))[1]
+
+
 def _lost(filter: Diagnoser, plant: Plant) -> Diagnoser:
     """Who says nothing in place of a filter, as lost ones do."""
-    _, said = filter.update(filter.init(1), np.array([[s.nominal for s in plant.observed]]))
+    said = first_word(filter, plant)
     wide = {name: a for name in ("estimate", "estimate_std", "label_probs") if (a := getattr(said, name)) is not None}
 
     def update(state: Array, obs: Array) -> tuple[Array, Diagnosis]:
@@ -170,7 +183,7 @@ def filter_features(plant: Plant, diagnosis: Diagnosis) -> Array:
     labels = len(plant.labels)
     found = [np.eye(labels + 1)[diagnosis.label]]  # the last column is a lost filter's -1
     if diagnosis.label_probs is not None:
-        found.append(np.log(np.maximum(diagnosis.label_probs, 1e-6)) / 5)
+        found.append(np.log(np.maximum(diagnosis.label_probs, 1e-6)) / LOGIT)
     if diagnosis.estimate is not None:
         found.append(np.arcsinh(2 * feat.deviation(plant, diagnosis.estimate)))
     if diagnosis.estimate_std is not None:
@@ -179,13 +192,19 @@ def filter_features(plant: Plant, diagnosis: Diagnosis) -> Array:
     return np.nan_to_num(np.concatenate(found, axis=1), nan=0.0, posinf=0.0, neginf=0.0)
 
 
+def belief_in(plant: Plant, diagnosis: Diagnosis) -> Array:
+    """What takes those features to logits as the filter means them (labels, ...): its log probabilities, else its label."""
+    labels, width = len(plant.labels), filter_features(plant, diagnosis).shape[1]
+    return TRUST * np.eye(labels, width) if diagnosis.label_probs is None else LOGIT * np.eye(labels, width, labels + 1)
+
+
 def filters_features(
-    plant: Plant, condition: Condition, filters: Sequence[str], obs: Array, period: int
+    plant: Plant, process: str, processes: Sequence[str], filters: Sequence[str], obs: Array, period: int
 ) -> list[Array]:  # fmt: skip
-    """What `filter_features` has of each filter at the newest sample of each step: (N, T, ...), float32."""
+    """What `filter_features` has of each shown filter at the newest sample of each step: (N, T, ...), float32."""
     found = []
     for name in filters:
-        decisions = run(shown_filter(name, plant, condition.process), obs)
+        decisions = run(shown_filter(name, plant, process, processes), obs)
         n, samples = decisions.label.shape
         steps = samples // period
         flat = [
@@ -217,9 +236,10 @@ def prepare(
     if filters:
         import joblib
 
-        task = joblib.delayed(filters_features)
-        jobs = min(len(pieces), joblib.cpu_count())
-        found = joblib.Parallel(jobs)(task(plant, condition, filters, record.obs[i], shape.period) for i in pieces)
+        task, jobs = joblib.delayed(filters_features), min(n, joblib.cpu_count())
+        told = plant, condition.process, [c.name for c in conditions], filters
+        pieces = np.array_split(np.arange(n), max(jobs, n // 50))  # most of the time is theirs: some for every processor
+        found = joblib.Parallel(jobs)(task(*told, record.obs[i], shape.period) for i in pieces)
         shown.append(np.concatenate([np.concatenate(piece, axis=2) for piece in found]))  # type: ignore[arg-type]
     parts = (record.label, feat.deviation(plant, record.target), scored_of(plant, condition, record))
     truth = [at_steps(a, shape.period)[:, :T] for a in parts]

@@ -255,7 +255,7 @@ def events_of(plant: Plant, scenarios: Sequence[FaultScenario], *, courses: int 
 
 
 def _longer(counts: Array, length: int) -> Array:
-    return np.pad(counts, (0, max(length - len(counts), 0)))
+    return counts if len(counts) >= length else np.pad(counts, (0, length - len(counts)))
 
 
 def _pieces(plant: Plant, groups: Sequence[tuple[int, int, list[Fault]]]) -> list[tuple[int, int, int]]:
