@@ -35,7 +35,6 @@ from baselines.learned.features import FeatureShape
 from baselines.learned.flights import CALIBRATION, PER_SEED, TEST, TRAINING, VALIDATION, Condition
 from baselines.learned.recipes import SequenceRecipe
 from fdi_gym.diagnosis import (
-    Diagnosis,
     NotApplicableError,
     diagnosers,
     find_diagnoser,
@@ -205,9 +204,9 @@ def test_streamed_diagnoses_are_those_of_the_whole_sequence(path):
     seen.append(flights.context(np.zeros(3, int), len(card.processes), 20))
     told = flights.filters_features(plant, condition.process, card.processes, card.filters, obs, shape.period)
     x = torch.from_numpy(np.concatenate([*seen, *told], axis=2)).double()
-    widths = [np.zeros((len(plant.labels), part.shape[2])) for part in told]
+    width = sum(part.shape[2] for part in told)
     memory = "attention" if card.method == "attention_net" else "recurrent"
-    size = (x.shape[2], len(plant.labels), len(plant.estimated), card.shape["hidden"], widths, len(card.processes), memory)
+    size = (x.shape[2], len(plant.labels), len(plant.estimated), card.shape["hidden"], width, len(card.processes), memory)
     net = SequenceNetwork(*size).double()
     net.load_state_dict({name: torch.from_numpy(tensors[f"network.{name}"]) for name in net.state_dict()})
     with torch.inference_mode():
@@ -244,37 +243,10 @@ def test_loss_falls_on_a_fixed_batch():
     assert values[-1] < 0.4 * values[0]
 
 
-def test_an_untrained_network_believes_the_filters_it_is_shown():
-    torch.manual_seed(0)
-    net = SequenceNetwork(8 + 2 + 4 + 6, 3, 2, 16, filters=(3 * np.eye(3, 4), 2 * np.eye(3, 6)), processes=2)
-    x = torch.zeros(2, 5, 20)
-    x[0, :, 8] = x[1, :, 9] = 1.0  # the first expects one process, the second the other
-    plain = net(x)[0]
-    x[0, :, 10 + 1] = x[0, :, 14 + 1] = x[1, :, 10 + 2] = 1.0  # both filters say 1; the first says 2, the other nothing
-    net.value.weight.data[:, 10:] = net.gate.weight.data[:, 10:] = net.join.weight.data[:, 10:20] = 0.0
-    gain = net(x)[0] - plain
-    assert torch.allclose(gain[0], torch.tensor([0.0, 5.0, 0.0]), atol=1e-5)
-    assert torch.allclose(gain[1], torch.tensor([0.0, 0.0, 3.0]), atol=1e-5)
-    net.direct.weight.data[:, :10] = 0.0  # trust of the first process
-    gain = net(x)[0] - plain
-    assert torch.allclose(gain[0], torch.zeros(3), atol=1e-5)
-    assert torch.allclose(gain[1], torch.tensor([0.0, 0.0, 3.0]), atol=1e-5)
-
-
-@pytest.mark.parametrize("name", ["multiple_model_ekf", "augmented_ekf_thresholds"])  # with probabilities, and without
-def test_what_an_untrained_network_believes_is_what_the_filter_means(name, b747):
-    filter, labels = make_diagnoser(name, b747), len(b747.labels)
-    said = flights.first_word(filter, b747)
-    rng, n = np.random.default_rng(0), 6
-    probs = None if said.label_probs is None else rng.dirichlet(np.ones(labels), n)
-    meant = rng.integers(0, labels, n)
-    further = {f: np.tile(a, (n, 1)) for f in ("estimate", "estimate_std") if (a := getattr(said, f)) is not None}
-    said = Diagnosis(np.zeros(n, bool), meant, label_probs=probs, **further)
-    logits = flights.filter_features(b747, said) @ flights.belief_in(b747, said).T
-    if probs is None:
-        assert_allclose(logits, flights.TRUST * np.eye(labels)[meant])
-    else:
-        assert_allclose(logits, np.log(probs), rtol=1e-12)
+def trusted(net, flown):
+    """What the direct way makes of what filters say (N, T, labels), process by process."""
+    weight = net.direct.weight.detach().numpy().reshape(net.labels, net.processes, net.told)
+    return np.einsum("ntf,nlf->ntl", flown.features[..., -net.told :], weight[:, flown.process].swapaxes(0, 1))
 
 
 @pytest.mark.parametrize(("plant_id", "filter"), [("DCMotor", "multiple_model_ekf"), ("B747Lateral", "two_stage_kf")])
@@ -298,18 +270,35 @@ def test_a_network_that_is_shown_filters_starts_from_one_that_is_not(plant_id, f
     old, new = load_file(base), training.network.state_dict()
     assert np.array_equal(new["memory.weight_hh_l0"], old["network.memory.weight_hh_l0"])
     assert not new["value.weight"][:, old["network.value.weight"].shape[1] :].any()
+    flown, labels = training.chunk(0), len(plant.labels)
+    told = training.network.told
+    said = np.stack([np.eye(told)[flown.label], np.eye(told)[labels - 1 - flown.label]])  # the second process's filters lie
+    made = flown._replace(
+        features=np.concatenate([flown.features[..., :-told], said[flown.process, np.arange(len(flown.label))]], axis=2,
+                                dtype=np.float32)
+    )  # fmt: skip
+    training.stack(made)
+    right = training.logits(made).argmax(axis=2) == flown.label
+    assert right[flown.scored].mean() > 0.999
+    training.stack(flown)
+    own = SupervisedTraining("sequence_net", plant, recipe, seed=0, work=tmp_path / "base").network
+    alone = training.logits(flown) - 10 * trusted(training.network, flown)
+    with torch.inference_mode():
+        plain = own(torch.from_numpy(flown.features[..., :-told]))[0].numpy()
+    scale = (alone * plain).sum() / (plain**2).sum()
+    assert_allclose(alone, scale * plain, atol=1e-4)
     path = training.run()
     assert weights.read_card(path).filters == [filter, "null"]
     check_diagnoser(lambda p, _: make_diagnoser("residual_net", p, path=str(path)), plant, samples=60)
 
 
 @pytest.mark.parametrize("memory", ["recurrent", "attention"])
-@pytest.mark.parametrize("filters", [(), (np.eye(3, 4), np.eye(3, 6))], ids=["alone", "filters"])
-def test_a_step_on_numpy_is_a_step_of_the_network_that_was_trained(filters, memory, monkeypatch):
+@pytest.mark.parametrize("told", [0, 10], ids=["alone", "filters"])
+def test_a_step_on_numpy_is_a_step_of_the_network_that_was_trained(told, memory, monkeypatch):
     monkeypatch.setattr(attention, "WINDOW", 5)  # shorter than what is shown
     monkeypatch.setattr(_attention, "WINDOW", 5)
     torch.manual_seed(0)
-    net = SequenceNetwork(8 + 2 + sum(a.shape[1] for a in filters), 3, 2, 16, filters, processes=2, memory=memory).double()
+    net = SequenceNetwork(8 + 2 + told, 3, 2, 16, told, processes=2, memory=memory).double()
     for value in net.parameters():
         value.data.normal_(std=0.7)
     tensors = {name: value.numpy() for name, value in net.state_dict().items()}

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from baselines.learned._attention import Attention
 from baselines.learned.sequence_net import LOG_STD, REACH
-from fdi_gym.plant import Array
 
 
 class SequenceNetwork(nn.Module):
@@ -27,15 +23,13 @@ class SequenceNetwork(nn.Module):
         labels: Labels of the isolation task.
         estimated: Entries of the identification task.
         hidden: Width of every layer.
-        filters: What takes the features of each filter, at the end of an input, to logits as it means them (labels, ...).
-            They reach the logits directly, too: an untrained network believes what the filters say, and training corrects
-            that, for each process apart.
+        told: Entries of what filters say, at an input's end: they reach the logits directly, too, for each process apart.
         processes: Entries before these that say which fault process to expect: 1 for one, 0 for the others.
         memory: "recurrent" or "attention".
     """
 
     def __init__(
-        self, features: int, labels: int, estimated: int, hidden: int, filters: Sequence[Array] = (), processes: int = 1,
+        self, features: int, labels: int, estimated: int, hidden: int, told: int = 0, processes: int = 1,
         memory: str = "recurrent",
     ):  # fmt: skip
         super().__init__()
@@ -45,11 +39,9 @@ class SequenceNetwork(nn.Module):
         self.memory = Attention(hidden) if memory == "attention" else nn.GRU(hidden, hidden, batch_first=True)
         self.read = nn.Linear(hidden, hidden)
         self.heads = nn.Linear(hidden, labels + 2 * estimated)
-        self.told, self.processes = sum(a.shape[1] for a in filters), processes
-        if filters:
-            self.direct = nn.Linear(processes * self.told, labels, bias=False)
-            believed = np.concatenate([*filters] * processes, axis=1) / REACH
-            self.direct.weight.data = torch.from_numpy(believed.astype(np.float32))
+        self.told, self.processes = told, processes
+        if told:
+            self.direct = nn.Linear(processes * told, labels, bias=False)
 
     def forward(self, x: Tensor, h: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Features (N, T, n) after the memory h (1, N, hidden): logits, mean, log std (N, T, ...), and the memory."""

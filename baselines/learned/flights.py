@@ -24,8 +24,6 @@ from fdi_gym.suite import chained
 # the first seed of each split, which ends where the next begins
 TEST, VALIDATION, CALIBRATION, TRAINING = 1_000_000, 2_000_000, 2_500_000, 3_000_000
 PER_SEED = 1_000_000  # training seeds that belong to one seed of a run
-LOGIT = 5.0  # one of a filter's log probabilities, in features
-TRUST = 3.0  # in the label of a filter without probabilities: a logit
 
 
 class Condition(NamedTuple):
@@ -183,19 +181,13 @@ def filter_features(plant: Plant, diagnosis: Diagnosis) -> Array:
     labels = len(plant.labels)
     found = [np.eye(labels + 1)[diagnosis.label]]  # the last column is a lost filter's -1
     if diagnosis.label_probs is not None:
-        found.append(np.log(np.maximum(diagnosis.label_probs, 1e-6)) / LOGIT)
+        found.append(np.log(np.maximum(diagnosis.label_probs, 1e-6)) / 5)
     if diagnosis.estimate is not None:
         found.append(np.arcsinh(2 * feat.deviation(plant, diagnosis.estimate)))
     if diagnosis.estimate_std is not None:
         unit = np.array([s.scale for s in plant.estimated])
         found.append(np.log(np.maximum(diagnosis.estimate_std / unit, 1e-4)) / 2)
     return np.nan_to_num(np.concatenate(found, axis=1), nan=0.0, posinf=0.0, neginf=0.0)
-
-
-def belief_in(plant: Plant, diagnosis: Diagnosis) -> Array:
-    """What takes those features to logits as the filter means them (labels, ...): its log probabilities, else its label."""
-    labels, width = len(plant.labels), filter_features(plant, diagnosis).shape[1]
-    return TRUST * np.eye(labels, width) if diagnosis.label_probs is None else LOGIT * np.eye(labels, width, labels + 1)
 
 
 def filters_features(
