@@ -1,5 +1,6 @@
 """Bayes' rule over onset, kind and size: against brute force, and what it counts in a process."""
 
+import dataclasses
 import functools
 
 import msgspec
@@ -17,7 +18,7 @@ from fdi_gym.diagnosis.fitting import fit_belief
 from fdi_gym.engine import simulate
 from fdi_gym.estimation import gaussian
 from fdi_gym.estimation.augmented import augmented, on_lines
-from fdi_gym.estimation.events import RISES, SATURATES, events_of
+from fdi_gym.estimation.events import RISES, SATURATES, WANDERS, events_of
 from fdi_gym.estimation.interval import Interval
 from fdi_gym.faults import Abrupt, Fault, FaultScenario, Hold, Incipient, Intermittent, Ramp, draw
 from fdi_gym.plant import NotApplicableError
@@ -198,6 +199,89 @@ def test_it_is_bayes_by_brute_force_where_all_onsets_are_kept():
         assert 0.01 < expected.max() < 1.0 - 1e-6  # the comparison says something
 
 
+def of_the_sensor(kind, onset, value):
+    """A fault of the sensor r that begins at a step."""
+    entry = {"bias": "bias_r", "noise": "noise_r", "freeze": "frozen_r"}[kind]
+    return b747(40).replace(faults=[Fault("r sensor", kind, onset, [Abrupt(entry, value)])])
+
+
+@pytest.mark.parametrize(("kind", "value"), [("bias", 0.2), ("noise", 1.0), ("freeze", 1.0)])
+def test_of_sensors_that_fail_too(kind, value):
+    """Of a sensor that is frozen all other readings are impossible, and one that comes again has a density of its own."""
+    plant, rng = build("B747Lateral", sensor_faults=True), np.random.default_rng(5)
+    belief = msgspec.structs.replace(
+        fit_belief(plant, "mixed"), disturbances=np.zeros(0, np.int64), d0=np.zeros(0), d_walk=np.zeros(0)
+    )
+    onsets = iter(rng.integers(5, 35, 80))
+    drawn = [of_the_sensor("bias", int(next(onsets)), b) for b in rng.normal(0.0, 0.1, 20)]
+    drawn += [of_the_sensor("noise", int(next(onsets)), v) for v in rng.uniform(0.5, 2.0, 20)]
+    drawn += [of_the_sensor("freeze", int(next(onsets)), 1.0) for _ in range(20)]
+    drawn += [b747(40, onset=int(next(onsets)), effect=Abrupt("gamma_rudder", -v)) for v in rng.uniform(0.1, 0.9, 20)]
+    events, every = events_of(plant, drawn + [b747(40)] * 120, courses=1), 8
+    bank = Bank(plant, belief, events, 40 // every + 1, every)
+    reference = draw(plant.process("standard"), FIRST).reference
+    obs = simulate(plant, [of_the_sensor(kind, 17, value).replace(noise_seed=3, reference=reference)]).obs
+    r = [s.name for s in plant.outputs].index("r")
+    comes_again = 10.0 - 0.5 * np.log(2 * np.pi * plant.outputs[r].sigma ** 2)
+    for part in (18, 41):  # the sensor's frozen reading has come twice, and often
+        y, logs, free = obs[0, :part], {}, 0.0
+        *_, s = states(plant, bank, obs[:, :part])
+        for step in range(0, part - 1, every):
+            rate = events.onset[step : step + every].sum()
+            for q in range(len(events.label)):
+                now = free + np.log(max(rate, 1e-12)) + events.log_prior[q] + log_density(
+                    plant, bank.model, events, y, [(q, step)]
+                )  # fmt: skip
+                if events.frozen[q] >= 0:
+                    same = y[step + 1 :, r] == y[step:-1, r]
+                    now += same.sum() * comes_again if same.all() else -np.inf
+                logs[q, step] = now
+            free += np.log1p(-max(rate, 1e-12))
+        logs[-1, 0] = free + log_density(plant, bank.model, events, y, [])
+        total = np.logaddexp.reduce(list(logs.values()))
+        expected = np.zeros(len(plant.labels))
+        for (q, _), value in logs.items():
+            expected[0 if q < 0 else events.label[q]] += np.exp(value - total)
+        assert_allclose(np.asarray(bank.read(s).probs)[0], expected, rtol=1e-5, atol=1e-9)
+        assert part > 18 or 0.01 < expected.max() < 1.0 - 1e-9  # the comparison says something
+    assert expected.argmax() == plant.label_of(frozenset({"r sensor"}))
+
+
+def test_what_says_nothing_of_a_frozen_sensor():
+    """A reading at the end of its range, one of a sensor without noise, and one that did not report."""
+    plant = build("B747Lateral", sensor_faults=True)
+    drawn = [of_the_sensor("freeze", 5, 1.0)] * 20
+    bank = Bank(plant, fit_belief(plant, "mixed"), events_of(plant, drawn), 2, 1)
+    before = np.array([[1.0, 2.0, plant.outputs[2].high, np.nan]])
+    density = -0.5 * np.log(2 * np.pi * np.array([s.sigma for s in plant.outputs]) ** 2)
+    found = bank.repeated(before, np.array([[1.0, 2.5, plant.outputs[2].high, 3.0]]), np.ones((1, 4), bool))[0]
+    assert_allclose(found[[0, 2, 3, 4]], [10.0 + density[0], density[2], 0.0, 0.0])
+    assert found[1] < -1e200
+    assert not bank.repeated(before, before, np.zeros((1, 4), bool)).any()
+    quiet = dataclasses.replace(plant, outputs=tuple(s._replace(sigma=0.0) for s in plant.outputs))
+    bank = Bank(quiet, fit_belief(plant, "mixed"), events_of(plant, drawn), 2, 1)
+    assert_allclose(bank.repeated(before, before, np.ones((1, 4), bool))[0, :2], density[:2])
+
+
+def test_a_lag_and_reports_that_do_not_come_have_no_course():
+    plant = build("B747Lateral", sensor_faults=True)
+    for entry in ("lag_r", "missing_r"):
+        with pytest.raises(NotApplicableError, match="has no course that could be known"):
+            events_of(plant, [b747(40).replace(faults=[Fault("r sensor", "x", 5, [Abrupt(entry, 1.0)])])])
+
+
+def test_noise_of_many_sizes_is_cut_by_them():
+    plant, rng = build("B747Lateral", sensor_faults=True), np.random.default_rng(6)
+    sizes = rng.uniform(0.5, 5.0, 90)
+    e = events_of(plant, [of_the_sensor("noise", 5, v) for v in sizes], courses=3)
+    sigma = next(s.sigma for s in plant.outputs if s.name == "r")
+    added = np.sort(sigma**2 * ((1.0 + sizes) ** 2 - 1.0)).reshape(3, 30).mean(axis=1)
+    assert [plant.theta_entries[i] for i in e.entries] == ["bias_r"]
+    assert_allclose(np.sort((e.direction[:, 0] ** 2).sum(axis=1)), added)
+    assert (e.first == 0.0).all()
+    assert (e.course == WANDERS).all()
+
+
 def test_events_that_end_give_their_weight_to_health_and_what_was_never_faulty_keeps_its_own(b747_ends):
     """No weight is lost, and the end of an event makes no flight one without any event so far."""
     bank, rng = b747_ends, np.random.default_rng(4)
@@ -307,12 +391,6 @@ def test_held_commands_are_those_at_the_onset():
 def test_numbers_out_of_range_are_refused(settings, what):
     with pytest.raises(ValueError, match=what):
         make_diagnoser("onset_bank", build("B747Lateral"), **settings)
-
-
-def test_where_sensors_may_fail_it_says_why_it_cannot():
-    plant = build("B747Lateral", sensor_faults=True)
-    with pytest.raises(NotApplicableError, match="no lines in theta"):
-        onset_bank(plant, fit_belief(plant, "mixed"), "mixed")
 
 
 @pytest.mark.parametrize("plant_id", ["B747Lateral", "MissilePitch"])

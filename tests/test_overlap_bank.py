@@ -186,8 +186,6 @@ def test_it_tells_faults_apart_that_overlap(plant, process, steps, least):
 def test_what_it_cannot_do_it_says():
     with pytest.raises(NotApplicableError, match="no two faults overlap"):
         make_diagnoser("overlap_bank", build("B747Lateral"), process="standard")
-    with pytest.raises(NotApplicableError, match="sensors that fail"):
-        make_diagnoser("overlap_bank", build("HUAVHover", sensor_faults=True), process="mixed")
 
 
 @pytest.mark.parametrize(

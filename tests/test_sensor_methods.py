@@ -16,7 +16,7 @@ from fdi_gym.testing import check_diagnoser
 
 FIRST = 4_500_000  # seed; neither test nor validation nor training flights
 FLIGHTS = 15
-GENERAL = ("augmented_ekf", "multiple_model_ekf", "glr_ekf")
+GENERAL = ("augmented_ekf", "multiple_model_ekf", "onset_bank", "glr_ekf")
 SEEN = ("freeze", "noise", "spikes")  # what no estimate shows
 
 
@@ -43,14 +43,14 @@ def diagnosed(name, kind):
 
 
 @pytest.mark.parametrize("kind", SEEN)
-@pytest.mark.parametrize("name", GENERAL[:2])
+@pytest.mark.parametrize("name", GENERAL[:3])
 def test_what_no_estimate_shows_is_named(name, kind):
     """At the flight's end; 13 of 15 and more, where 1 of 9 labels would be chance."""
     _, record = flown(kind)
     assert (diagnosed(name, kind).label[:, -1] == record.label[:, -1]).sum() >= FLIGHTS - 2
 
 
-@pytest.mark.parametrize("name", GENERAL[:2])
+@pytest.mark.parametrize("name", GENERAL[:3])
 def test_a_sensors_fault_is_not_taken_for_an_actuators(name):
     own, wrong, alarms = len(sick().bare.labels), 0, 0
     for kind in KINDS:
@@ -156,7 +156,16 @@ def test_dropout_raises_no_more_alarms(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["augmented_ekf", "multiple_model_ekf", "told_onset_bank", "told_source_oracle", "two_stage_kf"]
+    "name",
+    [
+        "augmented_ekf",
+        "multiple_model_ekf",
+        "onset_bank",
+        "told_events_oracle",
+        "told_onset_bank",
+        "told_source_oracle",
+        "two_stage_kf",
+    ],
 )
 def test_the_laws_of_diagnosers_hold_where_sensors_may_fail(name):
     check_diagnoser(lambda p, s: make_diagnoser(name, p, process="mixed", scenarios=s), sick())

@@ -99,6 +99,19 @@ def hear(e, t, u, known, lanes):
 
 
 @helper
+def silence(rows, first, some, kind, frozen, again, there, likelihood):
+    """Of sensors that are frozen in a lane nothing is heard, and `again` (m + 1) adds to the row's log likelihood."""
+    for lane in range(LANES):
+        i = rows[first + min(lane, some - 1)]
+        for j in range(kind.shape[1]):
+            a = frozen[kind[i, j]] if kind[i, j] >= 0 else there.shape[0]
+            if a < there.shape[0]:
+                there[a, lane] = 0.0
+                if lane < some:
+                    likelihood[i] += again[a]
+
+
+@helper
 def clear(log, X1, P1):
     """Nothing is where no filter runs."""
     for i in range(1, log.size):
@@ -166,13 +179,16 @@ def weighed(log, likelihood, given_up):
 
 
 @compiled(
-    void(int64, I1, V, V, M, M, BANK, float64, M3, V, M, M, M, B2, M3, M4, I3, M3, M4, M3, M4, M, M, M3)
+    void(int64, I1, V, V, M, M, BANK, float64, M3, V, M, M, M, B2, I1, M, M3, M4, I3, M3, M4, M3, M4, M, M, M3)
 )  # fmt: skip
 def weigh(
-    update_lanes_at, integers, reals, step, H, plain, bank, given_up, R, t, u, known, y, seen, X, P, kind, length, held,
-    X1, P1, log, nu, S,
+    update_lanes_at, integers, reals, step, H, plain, bank, given_up, R, t, u, known, y, seen, frozen, again, X, P, kind,
+    length, held, X1, P1, log, nu, S,
 ):  # fmt: skip
-    """X1 and P1 after the sensors y (n, m) that reported, and `log` (n, count) then; nu and S are the healthy filter's."""
+    """X1 and P1 after the sensors y (n, m) that reported, and `log` (n, count) then; nu and S are the healthy filter's.
+
+    frozen (r,): the sensor that each kind freezes, m: none; again (n, m + 1): log density of the reading if it is frozen.
+    """
     (n, count, N), E, sensors = X.shape, kind.shape[2], integers[SENSORS]
     lanes, lines, rows, likelihood = room_aboard(N, integers), room_of_lines(bank, E), ints(count), floats(count)
     ys, there, nus, Ss, Us, distances = room_of_update(N, sensors)
@@ -183,11 +199,12 @@ def weigh(
         many = running(log[e], rows)
         hear(e, t, u, known, lanes)
         likelihood[:] = 0.0
-        for a in range(sensors):
-            for lane in range(LANES):
-                ys[a, lane], there[a, lane] = y[e, a], seen[e, a]
         for first in range(0, many, LANES):
             some = min(LANES, many - first)
+            for a in range(sensors):
+                for lane in range(LANES):
+                    ys[a, lane], there[a, lane] = y[e, a], seen[e, a]
+            silence(rows, first, some, kind[e], frozen, again[e], there, likelihood)
             come_aboard(rows, first, some, X[e], P[e], kind[e], length[e], held[e], bank, lanes, lines)
             update_lanes(
                 EXTENDED, integers, reals, step, lines[0], lines[1], H, plain, 0, some, Xs, Ps, ts, us, ds, ys, there, R,
@@ -196,7 +213,7 @@ def weigh(
             go_ashore(rows, first, some, lanes, X1[e], P1[e])
             updated(0, there, nus, Ss, Us, distances, nu1, S1, distance, density)
             for lane in range(some):
-                likelihood[rows[first + lane]] = density[lane]
+                likelihood[rows[first + lane]] += density[lane]
             if first == 0:
                 for a in range(sensors):
                     nu[e, a] = nu1[0, a]

@@ -7,7 +7,7 @@ which one begins starts from what the other knows, with the magnitudes' prior; i
 beginning, times the likelihood of what was measured since. Of the hypotheses with the same kinds of event so many are kept,
 and of all of them so many: those two become one, mean and covariance matched, that are least likely for how close their
 onsets are, and the least likely give way. What an event leaves when it ends becomes one with the likeliest hypothesis
-without it.
+without it. Of a sensor that is frozen nothing is heard, and its reading must come again.
 
 The bank of hypotheses is D. T. Magill's, IEEE TAC 10(4), 1965; onsets kept in limited number: A. S. Willsky, H. L. Jones,
 IEEE TAC 21(1), 1976, and the generalised pseudo-Bayes estimators of J. K. Tugnait, Automatica 18(5), 1982; sets of them:
@@ -32,6 +32,7 @@ from fdi_gym.estimation.decision import Reading, Rule, by_candidate
 from fdi_gym.estimation.events import WANDERS, Events, events_of
 from fdi_gym.estimation.gaussian_step import predict_lanes, update_lanes
 from fdi_gym.estimation.interval import Interval
+from fdi_gym.estimation.sensor_checks import REPEATED
 from fdi_gym.kernels import address
 from fdi_gym.model import contiguous
 from fdi_gym.plant import Array, NotApplicableError, Plant
@@ -53,6 +54,7 @@ class Hypotheses(NamedTuple):
     since: Array  # (n,) step at which the last one ended for the others, on average
     length: Array  # (n, count, E) of the courses
     u: Array  # (n, n_u) the command before the last
+    y: Array  # (n, m) the last readings; NaN before the first
     nu: Array  # (n, m) innovation of the healthy filter
     S: Array  # (n, m, m) its covariance
 
@@ -86,6 +88,13 @@ class Bank:
             events.offset, events.direction, events.steady, events.steady_direction, events.mean, events.spread
         ))  # fmt: skip
         self.rates = np.where(events.course == WANDERS, events.first, 1.0)
+        heard = [plant.outputs[i] for i in belief.sensors]
+        self.inside = np.array([[s.low for s in heard], [s.high for s in heard]])
+        self.again = (
+            np.where([s.sigma > 0.0 for s in heard], REPEATED / 2.0, 0.0),
+            -0.5 * np.log(2 * np.pi * np.diag(self.model.R)),
+        )
+        self.frozen = np.array([[*belief.sensors.tolist(), i].index(i) for i in events.frozen], np.int64)
         ends = np.log1p(-np.minimum(events.end, 1 - 1e-12))
         self.stays = np.concatenate([[0.0], np.cumsum(ends)]) if ends.size else ends
         names, theta = [mode.name for mode in plant.modes], fault_inputs(plant).entries.tolist()
@@ -103,8 +112,8 @@ class Bank:
         return Hypotheses(
             np.tile(model.X0, (n, self.count, 1)), np.tile(model.P0, (n, self.count, 1, 1)), log,
             np.full(shape, -1, np.int64), np.zeros(shape), np.zeros((*shape, len(self.events.entries))), np.ones(n),
-            np.zeros(n), np.ones(shape), np.tile(self.plant.trim_command, (n, 1)), np.zeros((n, m)),
-            np.tile(model.R, (n, 1, 1)),
+            np.zeros(n), np.ones(shape), np.tile(self.plant.trim_command, (n, 1)),
+            np.full((n, m), np.nan), np.zeros((n, m)), np.tile(model.R, (n, 1, 1)),
         )  # fmt: skip
 
     def chances(self, s: Hypotheses, turn: Array, step: Array) -> Array:
@@ -169,13 +178,25 @@ class Bank:
     def update(self, s: Hypotheses, at: Interval, y: Array, seen: Array) -> Hypotheses:
         """Weigh and correct those that run; of those that have become negligible the place is free."""
         bound, heard = self.model.compiled, self.model.sensors
+        y, seen = y.take(heard, axis=1), seen.take(heard, axis=1)
         X, P, log, nu, S = np.empty(s.X.shape), np.empty(s.P.shape), s.log.copy(), np.empty(s.nu.shape), np.empty(s.S.shape)
         weigh(
             address(update_lanes), *bound.constants[:3], bound.H, bound.plain, self.does, GIVEN_UP, self.model.noises[1],
-            at.k * self.plant.dt, *self.given(at), y.take(heard, axis=1), seen.take(heard, axis=1), s.X, s.P, s.kind,
+            at.k * self.plant.dt, *self.given(at), y, seen, self.frozen, self.repeated(s.y, y, seen), s.X, s.P, s.kind,
             s.length, s.held, X, P, log, nu, S,
         )  # fmt: skip
-        return s._replace(X=X, P=P, log=log, nu=nu, S=S)
+        return s._replace(X=X, P=P, log=log, y=np.where(seen, y, s.y), nu=nu, S=S)
+
+    def repeated(self, before: Array, y: Array, seen: Array) -> Array:
+        """The log density of readings y (n, m) if their sensors are frozen (n, m + 1), in the last column of none.
+
+        A reading that comes again is likelier than its noise's most likely one by what `sensor_checks` has for it, but for
+        ends of the range and for sensors without noise. Another reading is impossible; what did not report says nothing.
+        """
+        surprise, density = self.again
+        inside = (y > self.inside[0]) & (y < self.inside[1])
+        found = np.where(y == before, density + surprise * inside, NEVER)
+        return np.pad(np.where(seen & np.isfinite(before), found, 0.0), [(0, 0), (0, 1)])
 
     def read(self, s: Hypotheses) -> Reading:
         """Probabilities of the labels, and the mean of the fault vector."""
@@ -197,11 +218,9 @@ def events_of_process(plant: Plant, process: str, courses: int, sizes: int) -> E
 
     Raises:
         ValueError: Cells are one or more.
-        NotApplicableError: Sensors may fail too, or a fault has no course that could be known.
+        NotApplicableError: A fault has no course that could be known.
     """
     at_least(1, courses=courses, sizes=sizes)
-    if plant.bare is not None:
-        raise NotApplicableError("sensors that fail by noise, freezing or spikes are no lines in theta")
     drawn = [plant.draw(process, VALIDATION_SEED + FIRST + i) for i in range(DRAWN)]
     return events_of(plant, drawn, courses=courses, sizes=sizes)
 

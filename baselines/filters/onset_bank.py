@@ -46,7 +46,7 @@ def onset_bank(
 
     Raises:
         ValueError: A number out of range.
-        NotApplicableError: Sensors may fail too, faults overlap, one has no course that could be known, or the process says
+        NotApplicableError: Faults overlap, one has no course that could be known, or the process says
             when they begin.
     """
     at_least(2, onsets=onsets)

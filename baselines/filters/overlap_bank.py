@@ -25,7 +25,7 @@ def overlap_bank(
     process: str,
     *,
     onsets: int = 2,
-    filters: int = 100,
+    filters: int | None = None,
     courses: int = 3,
     sizes: int = 1,
     every: int = 1,
@@ -38,7 +38,7 @@ def overlap_bank(
         belief: Model errors, and what is unknown beside faults.
         process: The fault process, of which it is told kinds, sizes and how long one thing takes after the other.
         onsets: How many hypotheses with the same kinds of event are kept, 2 or more.
-        filters: How many hypotheses are, in all: more than the kinds of event.
+        filters: How many hypotheses are, in all: more than the kinds of event. Default: three for two kinds, a hundred at least.
         courses: Cells of kinds whose course varies.
         sizes: Cells of each of those by the size.
         every: Samples from one onset to the next.
@@ -48,7 +48,7 @@ def overlap_bank(
 
     Raises:
         ValueError: A number out of range.
-        NotApplicableError: Sensors may fail too, a fault has no course that could be known, or no two faults overlap.
+        NotApplicableError: A fault has no course that could be known, or no two faults overlap.
     """
     at_least(2, onsets=onsets)
     at_least(1, every=every)
@@ -57,7 +57,10 @@ def overlap_bank(
     events = events_of_process(plant, process, courses, sizes)
     if not events.more.size:
         raise NotApplicableError("in this process no two faults overlap: onset_bank is for those that follow one another")
-    if filters <= len(events.label):
-        raise ValueError(f"filters are more than the {len(events.label)} kinds of event, not {filters}")
+    kinds = len(events.label)
+    if filters is None:
+        filters = max(100, 3 * kinds // 2)
+    if filters <= kinds:
+        raise ValueError(f"filters are more than the {kinds} kinds of event, not {filters}")
     belief = msgspec.structs.replace(belief, d_walk=disturbance * belief.d_walk)
     return diagnosing(Bank(plant, belief, events, onsets, every, filters))

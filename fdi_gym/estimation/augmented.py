@@ -237,4 +237,7 @@ def on_lines(
     model = base.replace(
         inputs=inputs, z=z, d=d, scale=scale, X0=X0, P0=P0, Q=Q, limit=np.full(N, np.inf), H=H, lines=(offset, direction)
     )
-    return model if entries is None else model.replace(H=_linear_sensors(model))
+    if entries is None:
+        return model
+    H = _linear_sensors(model.replace(lines=(np.zeros_like(offset), np.ones_like(direction))))
+    return model if H is None or H[:, z].any() else model.replace(H=H)  # on whatever line

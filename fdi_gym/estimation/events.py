@@ -4,6 +4,9 @@ An event is what begins and ends together: one fault, or several at once. Events
 the same way: at once to a value, or along a course of time. Within a kind the values are Gaussian along a few directions;
 a kind whose values or courses are spread widely is cut into cells. Events follow one another, or overlap: then others may
 begin while some act. All of it is counted in scenarios that are drawn from the process; nothing is flown.
+
+Sensors that fail (`fdi_gym.sensors`) are events like others: a bias, a drift and a gain move theta; more noise is a bias
+that is another at each sample, and spikes one that wanders; of a sensor that is frozen the last reading stays.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi_gym.faults import Abrupt, Fault, FaultScenario, Hold, Incipient, Intermittent, Ramp, Samples, Square
+from fdi_gym.model import SENSOR_FAULTS
 from fdi_gym.plant import Array, NotApplicableError, Plant
 
 FEWEST = 10  # events from which a cell is made
@@ -22,6 +26,7 @@ NEGLIGIBLE = 1e-6  # share of the largest variance below which a direction is le
 MOVED = 0.1  # what a held command may have moved since the onset, in units of its scale: it is not known to the sample
 MANY = 8  # parameters, beyond which they are left to the noise that stands for errors of the model
 BINS = 100  # of a flight, over which the onsets are counted
+WHITE = 2.0**0.5 * np.array([1.0, 0.0, -1.0, 0.0])  # has the moments of white noise of variance 1
 AT_ONCE, SATURATES, RISES, COMES_AND_GOES, ALTERNATES, WANDERS = range(6)  # courses
 
 
@@ -37,6 +42,7 @@ class Events(NamedTuple):
     steady_direction: Array  # (r, p, f) to the second
     held: Array  # (r, p) the command at whose value an entry is held from the onset on; -1: none
     lag: Array  # (r, p) how many steps before the onset that is
+    frozen: Array  # (r,) the output whose last reading stays; -1: none does
     course: Array  # (r,) one of the courses
     first: Array  # (r,) 1 / rate, duration or period of the course [s]; of one that wanders, its correlation over a sample
     second: Array  # (r,) duty
@@ -94,6 +100,7 @@ class _Event(NamedTuple):
     course: int
     held: list[int]  # (p,) commands
     lag: list[int]  # (p,)
+    frozen: int  # output; -1: none
     values: Array  # (p,) deviations
     steady: Array  # (p,) those without a course
     first: float
@@ -112,14 +119,34 @@ def _groups(scenario: FaultScenario) -> list[tuple[int, int, list[Fault]]]:
     return [(onset, end, faults) for (onset, end), faults in sorted(found.items())]
 
 
+def _moved(plant: Plant, name: str) -> tuple[int, str, int]:
+    """Which entry of theta stands for one, and of a sensor's how that fails and its output: the bias stands for the rest."""
+    entry, own, n_y = plant.theta_entries.index(name), plant.own_theta, len(plant.outputs)
+    if entry < own:
+        return entry, "", -1
+    column, output = divmod(entry - own, n_y)
+    how = SENSOR_FAULTS[column]
+    return entry if how == "gain" else own + SENSOR_FAULTS.index("bias") * n_y + output, how, output
+
+
 def _event(plant: Plant, entries: list[int], faults: list[Fault]) -> _Event:
     names, nominal = plant.theta_entries, plant.nominal_theta
     values, steady, held, lag = np.zeros(len(entries)), np.zeros(len(entries)), [-1] * len(entries), [0] * len(entries)
-    course, first, second, walker, walk = AT_ONCE, 1.0, 1.0, -1, np.zeros(0)
+    course, first, second, walker, walk, frozen = AT_ONCE, 1.0, 1.0, -1, np.zeros(0), -1
     commands = [s.name for s in plant.commands]
     for effect in itertools.chain.from_iterable(fault.effects for fault in faults):
-        j = entries.index(names.index(effect.entry))
+        entry, how, output = _moved(plant, effect.entry)
+        j = entries.index(entry)
         match effect:
+            case Abrupt(value=value) if how == "frozen":
+                frozen = output if value else -1
+                continue
+            case Abrupt(value=value) if how == "noise":
+                first = plant.outputs[output].sigma * np.sqrt((1.0 + value) ** 2 - 1.0)
+                course, walker, walk = WANDERS, j, first * WHITE
+                continue
+            case _ if how not in ("", "gain", "bias"):
+                raise NotApplicableError(f"{effect.entry} by {type(effect).__name__} has no course that could be known")
             case Hold(command=command):
                 held[j], lag[j], values[j] = commands.index(command), effect.lag, -nominal[entries[j]]
                 continue
@@ -149,8 +176,8 @@ def _event(plant: Plant, entries: list[int], faults: list[Fault]) -> _Event:
         values, steady = np.where(waves, values, 0.0), np.where(waves, steady, values)
     modes = frozenset(fault.mode for fault in faults)
     label = plant.label_of(modes)
-    kind = (label, tuple(sorted(fault.kind for fault in faults)), course, tuple(held), tuple(lag), walker)
-    return _Event(modes, label, kind, course, held, lag, values, steady, first, second, walker, walk)
+    kind = (label, tuple(sorted(fault.kind for fault in faults)), course, tuple(held), tuple(lag), walker, frozen)
+    return _Event(modes, label, kind, course, held, lag, frozen, values, steady, first, second, walker, walk)
 
 
 def _cells(events: list[_Event], courses: int, sizes: int) -> list[list[_Event]]:
@@ -194,8 +221,8 @@ def events_of(plant: Plant, scenarios: Sequence[FaultScenario], *, courses: int 
     Raises:
         NotApplicableError: The process has no faults, or one has no course that could be known.
     """
-    names = plant.theta_entries
-    entries = sorted({names.index(e.entry) for s in scenarios for fault in s.faults for e in fault.effects})
+    moved = {e.entry for s in scenarios for fault in s.faults for e in fault.effects}
+    entries = sorted({_moved(plant, name)[0] for name in moved})
     K, labels = max(s.steps for s in scenarios), len(plant.labels)
     first, again = _Count(K), _Count(K)
     samples, lasts, begun, acted = np.zeros(labels), _Count(K + 1), np.zeros(0), np.zeros(0)
@@ -246,7 +273,7 @@ def events_of(plant: Plant, scenarios: Sequence[FaultScenario], *, courses: int 
         np.array(entries), np.array([cell[0].label for cell in cells]),
         np.array([sum(1 << bits.index(name) for name in cell[0].modes) for cell in cells]),
         offset[:, 0], offset[:, 1], direction[:, :p], direction[:, p:], held, lag,
-        np.array([cell[0].course for cell in cells]), rates,
+        np.array([cell[0].frozen for cell in cells]), np.array([cell[0].course for cell in cells]), rates,
         np.array([np.mean([e.second for e in cell]) for cell in cells]), np.log(size / size.sum()),
         first.rate(max(1, K // BINS)), again.rate(max(1, K // BINS)),
         (_longer(begun, len(acted)) / np.maximum(acted, 1.0))[: len(begun)],
