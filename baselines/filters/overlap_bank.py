@@ -38,7 +38,7 @@ def overlap_bank(
         belief: Model errors, and what is unknown beside faults.
         process: The fault process, of which it is told kinds, sizes and how long one thing takes after the other.
         onsets: How many hypotheses with the same kinds of event are kept, 2 or more.
-        filters: How many hypotheses are, in all: more than the kinds of event. Default: three for two kinds, a hundred at least.
+        filters: How many hypotheses are, in all: more than the kinds of event. Default: three for two kinds, 100 at least.
         courses: Cells of kinds whose course varies.
         sizes: Cells of each of those by the size.
         every: Samples from one onset to the next.
