@@ -162,7 +162,7 @@ class Bank:
 
     def given(self, at: Interval) -> tuple[Array, Array]:
         """The commands, and what is measured of the disturbances."""
-        return contiguous(at.u), self.model.compiled.unmeasured if at.d is None else contiguous(at.d)
+        return contiguous(at.u), contiguous(self.model.compiled.known(at.d))
 
     def moved(self, s: Hypotheses, at: Interval, X: Array, P: Array) -> Hypotheses:
         """All filters, over the interval: into X and P, which may be those of the state if nobody else has it."""

@@ -163,6 +163,11 @@ def first_word(filter: Diagnoser, plant: Plant) -> Diagnosis:
     return filter.update(filter.init(1), np.array([[s.nominal for s in plant.observed]]))[1]
 
 
+def told_by(plant: Plant, filters: Sequence[Diagnoser]) -> int:
+    """How many features filters make."""
+    return sum(filter_features(plant, first_word(filter, plant)).shape[1] for filter in filters)
+
+
 def _lost(filter: Diagnoser, plant: Plant) -> Diagnoser:
     """Who says nothing in place of a filter, as lost ones do."""
     said = first_word(filter, plant)

@@ -130,6 +130,12 @@ FILTERS = {  # that residual_net is shown, and training flights per condition: f
     "CMGSatellite": (("multiple_model_ekf", "overlap_bank"), 240),
     "ThreeTank": (("onset_bank", "multiple_model_ekf"), 400),
 }
+SENSOR_FILTERS = {  # the same, where sensors may fail
+    "B747Lateral": (("onset_bank", "multiple_model_ekf"), 400),
+    "HUAVHover": (("overlap_bank", "multiple_model_ekf"), 300),
+    "MissilePitch": (("onset_bank", "multiple_model_ekf"), 300),
+    "ThreeTank": (("onset_bank", "multiple_model_ekf"), 400),
+}
 # fault windows in a flight that networks are shown, and their pace: whole flights are long, and its suites are so too
 WINDOWS = {"CMGSatellite": {"standard": (3, 0.2), "mixed": (3, 0.1)}}
 GAINS = {  # training flights per condition, and passes, of the network that corrects the gain of a filter
@@ -197,7 +203,7 @@ def attention_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
 
 def residual_recipe(plant: Plant, budget: int | None = None) -> SequenceRecipe:
     """The recipe of the network that is shown filters too; arguments as in `sequence_recipe`."""
-    filters, most = FILTERS.get(plant.id, GENERAL_FILTERS) if plant.bare is None else GENERAL_FILTERS
+    filters, most = (FILTERS if plant.bare is None else SENSOR_FILTERS).get(plant.id, GENERAL_FILTERS)
     flights = most if budget is None else budget
     chunk = min(most, flights)
     return replace(

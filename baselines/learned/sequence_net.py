@@ -21,7 +21,7 @@ import numpy as np
 
 from baselines.learned import attention, streams, weights
 from baselines.learned import features as feat
-from baselines.learned.flights import filter_features, first_word, shown_filter
+from baselines.learned.flights import filter_features, shown_filter, told_by
 from baselines.learned.probabilities import log_softmax
 from baselines.learned.recipes import attention_recipe, network_recipe, randomised_recipe, residual_recipe
 from fdi_gym.diagnosis import Diagnoser, Diagnosis, diagnoser, diagnosers, trainer
@@ -63,7 +63,7 @@ def sequence_net(plant: Plant, *, method: str = "sequence_net", process: str = "
         if name not in entries or entries[name].clairvoyant:
             raise weights.RefusedError(f"{file.with_suffix('.json')} names {name!r}, which is no filter that can be shown")
     filters = [shown_filter(name, plant, expected, card.processes) for name in card.filters]
-    told = sum(filter_features(plant, first_word(f, plant)).shape[1] for f in filters)
+    told = told_by(plant, filters)
     weights.check_tensors(file, tensors, tensor_shapes(plant, shape, hidden, told, len(card.processes), method))
     model = weights.model_of(tensors)
     net = {name.removeprefix("network."): value.astype(float) for name, value in tensors.items()}

@@ -92,14 +92,14 @@ def _call(kernel: Any, head: tuple[Any, ...], *arrays: Any) -> None:
 def f(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> Array:
     """The points X (n, points, N) one sample after t (n,) [s], without noise: (n, points, N)."""
     moved = np.empty(X.shape)
-    _call(kernels.images, (True, *model.constants), X, t, u, model.unmeasured if d is None else d, moved)
+    _call(kernels.images, (True, *model.constants), X, t, u, model.known(d), moved)
     return moved
 
 
 def h(model: Model, X: Array, t: Array, u: Array, d: Array | None = None) -> Array:
     """What the sensors read at the points X (n, points, N) at t (n,) [s], without noise: (n, points, m)."""
     y = np.empty((*X.shape[:2], model.m))
-    _call(kernels.images, (False, *model.constants), X, t, u, model.unmeasured if d is None else d, y)
+    _call(kernels.images, (False, *model.constants), X, t, u, model.known(d), y)
     return y
 
 
@@ -111,7 +111,7 @@ def jacobian_f(model: Model, X: Array, t: Array, u: Array, d: Array | None = Non
     _check_width(model, X)
     if model.constants[0][TANGENT]:
         X1, F = np.empty(X.shape), np.empty((*X.shape, X.shape[1]))
-        _call(kernels.differentiate, model.constants, X, t, u, model.unmeasured if d is None else d, X1, F)
+        _call(kernels.differentiate, model.constants, X, t, u, model.known(d), X1, F)
         return X1, F
     return _differences(model, f(model, _along_axes(model, X), t, u, d))
 
@@ -158,9 +158,8 @@ def predict(
         ValueError: Unknown rule, or shapes that do not fit.
     """
     X1, P1 = np.empty(X.shape), np.empty(P.shape)
-    known = model.unmeasured if d is None else d
     constants = (address(predict_lanes), _rule(rule), *model.constants, model.limit, model.linear)
-    _call(kernels.predict, constants, X, P, t, u, known, Q, X1, P1)
+    _call(kernels.predict, constants, X, P, t, u, model.known(d), Q, X1, P1)
     return X1, P1
 
 
@@ -187,10 +186,9 @@ def update(
     n, m = len(X), model.m
     X1, P1, nu, S = np.empty(X.shape), np.empty(P.shape), np.empty((n, m)), np.empty((n, m, m))
     nis, log, count = np.empty(n), np.empty(n), np.empty(n, np.int64)
-    known = model.unmeasured if d is None else d
     _call(
         kernels.update, (address(update_lanes), _rule(rule), *model.constants, model.H, model.plain, seen, count),
-        X, P, t, u, known, y, R, X1, P1, nu, S, nis, log,
+        X, P, t, u, model.known(d), y, R, X1, P1, nu, S, nis, log,
     )  # fmt: skip
     return Updated(X1, P1, nu, S, nis, log, count)
 

@@ -28,6 +28,10 @@ class Model(NamedTuple):
     plain: Array  # (m, n_x) what sensors read of x where that is all but their own faults, or (0, n_x) where it is not
     unmeasured: Array  # (1, n_D) zeros
 
+    def known(self, d: Array | None) -> Array:
+        """The disturbances that are measured (n, n_D), or zeros (1, n_D) where none is."""
+        return self.unmeasured if d is None else d
+
     def __reduce__(self) -> tuple[Any, ...]:
         """Copied and pickled without the addresses of compiled code, which hold in this process only."""
         integers, *rest = self.constants
