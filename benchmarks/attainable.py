@@ -61,7 +61,8 @@ table has it or `onset_bank_fine`, which takes an onset at every sample, or wher
 best). It is exact where the model is linear, sizes are Gaussian and every onset is kept; the sections below show on fresh
 flights how far its score moves as that is refined: where it still moves, what can be attained lies higher. Where another
 method is better, it has not converged, or its model is off: gusts are bursts, and it takes them for a walk. Where sensors
-fail in ways that are no line in theta, no bank can run.
+fail (`*-mixed`), a bias, a drift and a gain are lines in theta, more noise and spikes are a bias that is another at each
+sample, and a frozen reading must come again; spikes are rarer and larger than that, so there it is not exact.
 """
 
 

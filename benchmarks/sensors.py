@@ -31,7 +31,8 @@ healthy are detected, the median time until then, and the confusion that matters
 plant's own or the reverse. "False alarms" are healthy flights that are declared faulty.
 
 The general filters know biases as lines of the fault vector, and check each channel for readings that repeat, have grown
-noisier or jump; a gain is neither.
+noisier or jump; a gain is neither. The banks over events (`onset_bank`, `overlap_bank`) are told how the process draws kinds
+and sizes, and weigh each kind of each sensor since each onset.
 """
 
 

@@ -249,11 +249,6 @@ def front(found: list[Board]) -> str:
     return text
 
 
-def render(results: Path, suites: Sequence[str] = ()) -> dict[str, str]:
-    """All pages by file name; arguments as `boards`.
-
-    Raises:
-        RefusedError: As `read_board`: no page is made.
-    """
-    found = boards(results, suites)
+def pages(found: list[Board]) -> dict[str, str]:
+    """All pages of boards, by file name."""
     return {"README.md": front(found), **{f"{board.suite.name}.md": page(board) for board in found}}

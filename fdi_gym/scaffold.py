@@ -121,6 +121,6 @@ def _make_row(folder: Path, name: str, bench: str, plant_id: str, methods: list[
     found = evaluate(suite, methods, work=folder / "runs", jobs=1, progress=False, command=f"fdi-gym evaluate {bench}")
     row.write_rows(folder / "results", suite, found)
     (folder / "boards").mkdir()
-    for page, text in leaderboard.render(folder / "results", [str(path)]).items():
+    for page, text in leaderboard.pages(leaderboard.boards(folder / "results", [str(path)])).items():
         write_whole(folder / "boards" / page, text.encode())
     write_whole(folder / ".gitignore", b"runs/\n__pycache__/\n")

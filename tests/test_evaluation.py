@@ -189,9 +189,15 @@ def test_suite_seeds_are_public_test_seeds():
 # -- the pages
 
 
-def test_committed_page_is_what_the_rows_say():
-    """Renders the tables again, which checks every row on the way."""
-    for name, text in leaderboard.render(ROOT / "leaderboards" / "results").items():
+@pytest.fixture(scope="module")
+def committed():
+    """All boards: every row is checked on the way."""
+    return leaderboard.boards(ROOT / "leaderboards" / "results")
+
+
+def test_committed_page_is_what_the_rows_say(committed):
+    """Renders the tables again."""
+    for name, text in leaderboard.pages(committed).items():
         assert (ROOT / "leaderboards" / name).read_text() == text
         for picture in re.findall(r"\((pictures/.*?)\)", text):
             assert (ROOT / "leaderboards" / picture).exists()
@@ -208,9 +214,9 @@ def test_every_committed_table_is_framed():
         assert any(above(row) for row in rows), folder.name
 
 
-def test_no_committed_row_beats_a_ceiling():
+def test_no_committed_row_beats_a_ceiling(committed):
     """Beyond the paired interval, per sample and per decision: else it is none."""
-    for board in leaderboard.boards(ROOT / "leaderboards" / "results"):
+    for board in committed:
         if isinstance(board.suite, ActingSuite):
             continue
         for kind in ("per_sample", "per_decision"):
@@ -238,13 +244,13 @@ def test_what_is_attained_is_counted_from_chance_between_the_best_and_the_ceilin
 
 def test_a_page_is_rendered_from_the_rows_that_are_there(small, found, tmp_path, monkeypatch):
     monkeypatch.setattr(suite, "SUITES", small.parent)
-    assert leaderboard.render(tmp_path) == {"README.md": leaderboard.INTRODUCTION}
+    assert leaderboard.pages(leaderboard.boards(tmp_path)) == {"README.md": leaderboard.INTRODUCTION}
     write_rows(tmp_path, load_suite("small"), {name: found[name] for name in ("null", "known_onset_oracle")})
-    page = leaderboard.render(tmp_path)["small.md"]
+    page = leaderboard.pages(leaderboard.boards(tmp_path))["small.md"]
     assert page.index("| known_onset_oracle * |") < page.index("| null ")
     assert "- known_onset_oracle knows when each fault begins and ends." in page
     write_rows(tmp_path, load_suite("small"), {"two_stage_kf_exponential": found["two_stage_kf_exponential"]})
-    pages = leaderboard.render(tmp_path)
+    pages = leaderboard.pages(leaderboard.boards(tmp_path))
     assert pages["small.md"].count("\n| ") == page.count("\n| ") + len(tables.RANKINGS)
     assert "| [small](small.md) | 12 " in pages["README.md"]
     assert "two_stage_kf_exponential" in pages["README.md"]
@@ -254,7 +260,7 @@ def test_a_page_is_rendered_from_the_rows_that_are_there(small, found, tmp_path,
     path = row_path(tmp_path, "small", "null")
     path.rename(path.with_name("random.json"))
     with pytest.raises(RefusedError, match="is the row of null"):
-        leaderboard.render(tmp_path)
+        leaderboard.boards(tmp_path)
 
 
 def test_text_from_files_is_shown_as_it_is():

@@ -33,10 +33,11 @@ def leaderboard(
     if not results.is_dir():
         raise ValueError(f"{results} is no folder of rows")
     make_room(pages / "README.md")
-    for name, text in leaderboard.render(results, suites).items():
+    boards = leaderboard.boards(results, suites)
+    for name, text in leaderboard.pages(boards).items():
         write_whole(pages / name, text.encode())
         print(pages / name)
-    for board in leaderboard.boards(results, suites) if pictures else ():
+    for board in boards if pictures else ():
         leaderboard.draw(board, pages / "pictures")
 
 
