@@ -134,6 +134,25 @@ def test_an_entry_beyond_theta_is_a_physical_parameter():
     assert_allclose(found[:, n_x], m)
 
 
+@pytest.mark.parametrize(("entry", "linear"), [("gamma_rudder", True), ("bias_r", False), ("gain_r", False)])
+def test_sensors_are_a_matrix_only_where_they_do_not_see_what_a_line_moves(entry, linear):
+    """Whatever the line is that the model is first bound on."""
+    plant = build("B747Lateral", sensor_faults=True)
+    line = np.zeros((1, 1)), np.zeros((1, 1, 1)), np.zeros((1, 1))
+    entries = np.array([plant.theta_entries.index(entry)])
+    model = on_lines(augmented(plant, fit_belief(plant, "mixed")), *line, 1.0, entries)
+    assert (model.H is not None) == linear
+    moved = model.on(np.array([[0.3]]), np.array([[[0.5]]]))
+    X = moved.X0 + 0.1 * np.random.default_rng(0).standard_normal((3, len(moved.X0)))
+    at = Interval(np.ones(3, int), np.tile(plant.trim_command, (3, 1)), None, np.zeros((3, 0)))
+    theta = np.tile(plant.nominal_theta, (3, 1))
+    theta[:, entries[0]] += 0.3 + 0.5 * X[:, moved.z.start]
+    expected = plant.measure(np.full(3, plant.dt), X[:, moved.x], at.u, theta, None)[:, moved.sensors]
+    assert_allclose(moved.h(X[:, None], at)[:, 0], expected, rtol=1e-9)
+    updated = moved.update("extended", X, np.tile(1e-6 * np.eye(X.shape[1]), (3, 1, 1)), at, expected, np.ones((3, 4), bool))
+    assert_allclose(updated.nu, 0.0, atol=1e-9)
+
+
 def test_other_lines_are_those_of_a_model_that_is_bound_anew():
     plant = build("ThreeTank")
     base = augmented(plant, fit_belief(plant, "standard"))

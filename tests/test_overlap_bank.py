@@ -14,6 +14,7 @@ from fdi_gym.diagnosis import make_diagnoser, run
 from fdi_gym.diagnosis.fitting import fit_belief
 from fdi_gym.engine import simulate
 from fdi_gym.estimation.events import ALTERNATES, WANDERS, events_of
+from fdi_gym.estimation.interval import Interval
 from fdi_gym.faults import Abrupt, Fault, FaultScenario, Samples, Square, draw
 from fdi_gym.plant import NotApplicableError
 
@@ -181,6 +182,47 @@ def test_it_tells_faults_apart_that_overlap(plant, process, steps, least):
     valid = np.arange(record.obs.shape[1]) <= record.length[:, None]
     said = run(make_diagnoser("overlap_bank", plant, process=process), record.obs).label
     assert (said == record.label)[valid].mean() > least
+
+
+@pytest.mark.parametrize("comes_again", [True, False])
+def test_of_a_sensor_that_is_frozen_beside_another_event_nothing_is_heard(comes_again):
+    """In its hypotheses alone: the filter is the one without that sensor, and another reading is the end of them."""
+    plant, rng = build("B747Lateral", labels="dual", sensor_faults=True), np.random.default_rng(8)
+    drawn = [flight(rudder(10, None, -a), aileron(30, None, -b)) for a, b in rng.uniform(0.1, 0.9, (30, 2))]
+    drawn += [flight(Fault("r sensor", "freeze", 20, [Abrupt("frozen_r", 1.0)]))] * 20 + [flight()] * 40
+    events = events_of(plant, drawn, courses=1)
+    bank = Bank(plant, without_disturbances(plant, "mixed"), events, 2, 1, 20)
+    frozen = int(np.flatnonzero(events.frozen >= 0)[0])
+    loss = int(np.flatnonzero(events.label == plant.label_of(frozenset({"rudder LOE"})))[0])
+    pair = sorted((frozen, loss))
+    s, r = bank.start(1), [o.name for o in plant.outputs].index("r")
+    s.kind[0, 1], s.kind[0, 2, 0], s.log[0, :3] = pair, loss, np.log([0.2, 0.5, 0.3])
+    N = s.X.shape[2]
+    root = 0.1 * rng.standard_normal((3, N, N))
+    s.X[0, :3], s.P[0, :3] = 0.1 * rng.standard_normal((3, N)), root @ np.swapaxes(root, 1, 2)
+    before = rng.standard_normal((1, 4))
+    y = before + 0.1
+    if comes_again:
+        y[0, r] = before[0, r]
+    at = Interval(np.array([5]), plant.trim_command[None], None, np.zeros((1, 0)))
+    after = bank.update(s._replace(y=before), at, y, np.ones((1, 4), bool))
+    gain, log = [], [s.log[0, i] for i in range(3)]
+    for i, kinds in enumerate(([], pair, [loss])):
+        direction = np.zeros((1, len(events.entries), bank.width))
+        for place, q in enumerate(kinds):
+            direction[0, :, place * bank.f : (place + 1) * bank.f] = events.direction[q]
+        offset = sum((events.offset[q] for q in kinds), np.zeros(len(events.entries)))[None]
+        seen = np.ones((1, 4), bool)
+        seen[0, r] = frozen not in kinds
+        found = bank.model.on(offset, direction).update("extended", s.X[:, i], s.P[:, i], at, y, seen)
+        gain.append(float(found.log_likelihood[0]))
+        if i != 1 or comes_again:
+            assert_allclose(after.X[0, i], found.X[0], rtol=1e-9, atol=1e-12)
+            assert_allclose(after.P[0, i], found.P[0], rtol=1e-9, atol=1e-12)
+    gain[1] += 10.0 - 0.5 * np.log(2 * np.pi * plant.outputs[r].sigma ** 2) if comes_again else -np.inf
+    logs = np.array(log) + gain
+    assert_allclose(np.exp(after.log[0, :3]), np.exp(logs - np.logaddexp.reduce(logs)), rtol=1e-9)
+    assert after.y[0].tolist() == y[0].tolist()
 
 
 def test_what_it_cannot_do_it_says():
