@@ -132,7 +132,6 @@ FILTERS = {  # that residual_net is shown, and training flights per condition: f
 }
 SENSOR_FILTERS = {  # the same, where sensors may fail
     "B747Lateral": (("onset_bank", "multiple_model_ekf"), 400),
-    "HUAVHover": (("overlap_bank", "multiple_model_ekf"), 300),
     "MissilePitch": (("onset_bank", "multiple_model_ekf"), 300),
     "ThreeTank": (("onset_bank", "multiple_model_ekf"), 400),
 }
