@@ -1,8 +1,8 @@
-"""A ceiling for any plant whose sensors may fail: told when the label changes, and whether it is a sensor that fails.
+"""A ceiling where sensors may fail, of a plant that has one: told when the label changes, and whether a sensor fails.
 
 Which sensor it is, the bank of `told_onset_bank` says among the sensors' labels. Which of the plant's own faults it is, the
-plant's own ceiling says, which knows when they act and marginalises what else is unknown of that plant; where it has none
-the bank does, among the plant's labels, with the same prior for all. What is lost is what nobody can tell apart there.
+plant's own ceiling says, which knows when they act and marginalises what else is unknown of that plant. What is lost is what
+nobody can tell apart there.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import msgspec
 import numpy as np
 
 from baselines.oracles.cramer_rao_oracle import cramer_rao_oracle
-from baselines.oracles.innovation_oracle import innovation_oracle
 from baselines.oracles.known_onset_oracle import known_onset_oracle
 from baselines.oracles.matched_oracle import matched_oracle
 from baselines.oracles.told_onset_bank import rows, told_bank
@@ -25,7 +24,7 @@ from fdi_gym.estimation.belief import Belief
 from fdi_gym.faults import FaultScenario
 from fdi_gym.plant import Array, NotApplicableError, Plant
 
-CEILINGS: tuple[Callable[..., Diagnoser], ...] = (innovation_oracle, matched_oracle, known_onset_oracle, cramer_rao_oracle)
+CEILINGS: tuple[Callable[..., Diagnoser], ...] = (matched_oracle, known_onset_oracle, cramer_rao_oracle)
 
 
 class Told(NamedTuple):
@@ -51,8 +50,12 @@ def even(plant: Plant, belief: Belief) -> Belief:
     return msgspec.structs.replace(belief, m_mean=mean, m_std=std, m_walk=walk)
 
 
-def own_ceiling(plant: Plant, scenarios: Sequence[FaultScenario]) -> Diagnoser | None:
-    """The ceiling of a plant whose sensors do not fail; None where it has none."""
+def own_ceiling(plant: Plant, scenarios: Sequence[FaultScenario]) -> Diagnoser:
+    """The ceiling of a plant whose sensors do not fail.
+
+    Raises:
+        NotApplicableError: It has none.
+    """
     modes = set(plant.mode_names)
     own = [s.replace(faults=[f for f in s.faults if f.mode in modes]) for s in scenarios]
     for make in CEILINGS:
@@ -60,7 +63,9 @@ def own_ceiling(plant: Plant, scenarios: Sequence[FaultScenario]) -> Diagnoser |
             return make(plant, scenarios=own)
         except NotApplicableError:
             continue
-    return None
+    raise NotApplicableError(
+        f"{plant.id} has no ceiling of its own; where its faults do not overlap it has told_events_oracle"
+    )
 
 
 @diagnoser(
@@ -79,20 +84,16 @@ def told_source_oracle(plant: Plant, belief: Belief, *, scenarios: Sequence[Faul
             what the plant's own ceiling reads of its faults.
 
     Raises:
-        NotApplicableError: Its sensors never fail, or the bank cannot run on it.
+        NotApplicableError: Its sensors never fail, it has no ceiling of its own, or the bank cannot run on it.
         ValueError (from init): The number of episodes is not that of the scenarios.
     """
     if plant.bare is None:
         raise NotApplicableError(f"no label of {plant.id} is a sensor's fault; with the option sensor_faults there are")
     labels, of_plant = len(plant.labels), len(plant.bare.labels)
     label = true_labels(plant, scenarios)
-    told, of_sensor = (label >= of_plant)[..., None], np.arange(labels) >= of_plant
-    ceiling = own_ceiling(plant.bare, scenarios)
-    allowed = told == of_sensor if ceiling is None else told & of_sensor
+    own = widened(own_ceiling(plant.bare, scenarios), plant.bare, plant)
+    allowed = (label >= of_plant)[..., None] & (np.arange(labels) >= of_plant)
     hypotheses = told_bank(plant, rows(plant, even(plant, belief)), scenarios, allowed=allowed)
-    if ceiling is None:
-        return hypotheses
-    own = widened(ceiling, plant.bare, plant)
 
     def start(n: int) -> Told:
         return Told(hypotheses.init(n), own.init(n), label, np.zeros(n, np.int64))
