@@ -442,7 +442,7 @@ def test_rows_that_would_be_lost_are_named(capsys, here, small):
 def test_a_place_that_cannot_be_is_refused_before_anything_is_computed(capsys, monkeypatch, tmp_path, words):
     from fdi_gym import diagnosability, evaluation, leaderboard, pictures, report
 
-    for module, name in ((evaluation, "evaluate"), (pictures, "picture"), (report, "report"), (leaderboard, "render"),
+    for module, name in ((evaluation, "evaluate"), (pictures, "picture"), (report, "report"), (leaderboard, "boards"),
                          (diagnosability, "diagnosability")):  # fmt: skip
         monkeypatch.setattr(module, name, None)
     (tmp_path / "file").write_text("")
