@@ -22,7 +22,7 @@ def log_density(plant, model, events, obs, beginnings):
     """Log density of all measurements (K + 1, n_obs) if events of these kinds begin at these steps, and stay.
 
     The joint Gaussian of all states is propagated, and with it the covariance of the present one with each measurement. Of a
-    sensor that is frozen the readings are left out.
+    sensor that is frozen a reading has a density of its own where it comes again, and is impossible where it does not.
     """
     f, width = events.direction.shape[2], model.z.stop - model.z.start
     y, u, _ = plant.split(obs)
@@ -59,4 +59,10 @@ def log_density(plant, model, events, obs, beginnings):
         S[rows, rows] = H @ P @ H.T + model.R
         past.append(P @ H.T)
     use = heard.ravel()
-    return multivariate_normal.logpdf(y[:, model.sensors].ravel()[use], np.concatenate(means)[use], S[np.ix_(use, use)])
+    found = multivariate_normal.logpdf(y[:, model.sensors].ravel()[use], np.concatenate(means)[use], S[np.ix_(use, use)])
+    for kind, step in beginnings:
+        if events.frozen[kind] >= 0:
+            same = np.diff(y[step:, events.frozen[kind]]) == 0.0
+            sigma = plant.outputs[events.frozen[kind]].sigma
+            found += same.sum() * (10.0 - 0.5 * np.log(2 * np.pi * sigma**2)) if same.all() else -np.inf
+    return found
